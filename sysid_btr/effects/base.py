@@ -1,0 +1,96 @@
+"""What an effect is: a modifier that is neutral by default, sized by the robot, and scanned for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Self
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.models.modifier import Kind, Modifier, Parameter
+from sysid_btr.models.scales import JointScale, Scales
+
+if TYPE_CHECKING:
+    from sysid_btr.models.fields import Scope
+
+Probe = tuple[tuple[float, ...], ...]
+"""Values (one tuple a direction) whose responses span an effect linearly at one working point."""
+
+
+@dataclass(frozen=True)
+class Effect(Modifier):
+    """A physical effect that a model may lack.
+
+    Class attributes
+    ----------------
+    name : as in results and on the command line.
+    title : in a sentence, after an amount: "0.33 Nm of dry friction".
+    scope : which names it can sit at.
+    confounders : effects that leave similar traces, and what tells them apart.
+    needs : sensors without which it cannot be seen.
+    variant : tells apart two realisations under one name; empty for most.
+    signed : whether its amounts may have either sign.
+    structural : whether it adds joints to the model, which then has to be compiled for its places.
+    main : kind whose value says how large the effect is.
+    """
+
+    title: ClassVar[str] = ""
+    scope: ClassVar[Scope] = "joint"
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = ()
+    needs: ClassVar[str] = "position"
+    variant: ClassVar[str] = ""
+    signed: ClassVar[bool] = False
+    structural: ClassVar[bool] = False
+    main: ClassVar[int] = 0
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        """The kinds with nominal value, bounds and scale for one place."""
+        return cls.kinds
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        """Alternative working points of the scan at one place; each spans the effect linearly."""
+        kinds = cls.sized(scale)
+        return tuple(
+            (tuple(k.nominal + step * k.scale if i == cls.main else k.nominal for i, k in enumerate(kinds)),)
+            for step in (1.0, 4.0)
+        )
+
+    @classmethod
+    def at(cls, places: Sequence[str], scales: Scales, *, shared: bool = False) -> Self:
+        """The effect at some places of a robot whose sizes are known."""
+        bare = cls(places=tuple(places), shared=shared and len(places) > 1)
+        names = [p.name for p in bare.parameters]
+        known = []
+        for group in bare.groups:
+            first = group.split(",")[0]
+            for kind in cls.sized(scale_at(scales, first)):
+                known.append(
+                    Parameter(
+                        names[len(known)], kind.unit, kind.nominal, kind.lower, kind.upper, kind.scale
+                    )
+                )
+        return replace(bare, known=tuple(known))
+
+    @property
+    def neutral(self) -> FloatArray:
+        """(parameters,) values at which the model is exactly the plain one."""
+        return np.array([p.nominal for p in self.parameters])
+
+
+def scale_at(scales: Scales, place: str) -> JointScale:
+    """Size at a joint; for a body that of the joint it hangs on; for the robot the largest of all."""
+    if place in scales:
+        return scales[place]
+    whole = list(scales.values())
+    return JointScale(
+        torque_rms=max(s.torque_rms for s in whole),
+        torque_peak=max(s.torque_peak for s in whole),
+        velocity_rms=max(s.velocity_rms for s in whole),
+        velocity_peak=max(s.velocity_peak for s in whole),
+        acceleration_rms=max(s.acceleration_rms for s in whole),
+        span=max(s.span for s in whole),
+    )

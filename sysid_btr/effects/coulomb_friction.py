@@ -1,0 +1,34 @@
+"""Dry friction: a torque of constant size against the motion; it holds the joint still up to that size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.effects.base import Effect
+from sysid_btr.models.modifier import Kind, Rig
+from sysid_btr.models.scales import JointScale
+
+
+@dataclass(frozen=True)
+class CoulombFriction(Effect):
+    """Native: `dof_frictionloss`."""
+
+    name: ClassVar[str] = "coulomb_friction"
+    title: ClassVar[str] = "dry friction"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.05),)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("stribeck_friction", "slow motion below the Stribeck velocity"),
+        ("load_friction", "the same motion under different loads"),
+        ("backlash", "reversals under a load that does not change sign"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return (
+            Kind("torque", scale.unit("Nm"), 0.0, 0.0, max(scale.torque_peak, 1e-9), 0.15 * scale.torque_rms),
+        )
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        rig.array("dof_frictionloss")[:, rig.index.dof[rig.index.of(self.places)]] += values[:, :, 0]

@@ -1,0 +1,74 @@
+"""Compliance between motor and link: a gear or shaft that twists; sensor on the link, servo on the motor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.effects.backlash import LINK, add_link_joint
+from sysid_btr.effects.base import Effect, Probe
+from sysid_btr.models.modifier import Kind, Rig
+from sysid_btr.models.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
+
+STIFFEST = 2e-4
+"""Softness, relative to torque, below which the step cannot resolve the spring."""
+RELAXATION = 0.004
+"""Ratio of the spring's damping to its stiffness, s: well damped, as gears are."""
+
+
+@dataclass(frozen=True)
+class JointCompliance(Effect):
+    """Structure: a second joint on the link with a stiff spring."""
+
+    name: ClassVar[str] = "joint_compliance"
+    title: ClassVar[str] = "softness of the gear"
+    variant: ClassVar[str] = "link"
+    scope: ClassVar = "servo"
+    structural: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("softness", "rad/Nm", 0.0, 0.0, 0.2, 0.005),)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("backlash", "loads of several sizes"),
+        ("kp", "a logged effort, or fast motion"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        size = 0.004 * max(scale.span, 1e-9) / max(scale.torque_rms, 1e-9)
+        return (Kind("softness", scale.unit("rad/Nm"), 0.0, 0.0, 100 * size, size),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        size = cls.sized(scale)[0].scale
+        return (((2 * size,),), ((8 * size,),))
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        for name in self.places:
+            add_link_joint(spec, name, damping_on_link=self.variant == "link")
+            spec.joint(name + LINK).stiffness = [1.0, 0.0, 0.0]
+            spec.joint(name + LINK).damping = [1.0, 0.0, 0.0]
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        ids = np.array([rig.model.joint(name + LINK).id for name in self.places])
+        own = np.array([rig.model.joint(name).id for name in self.places])
+        dofs = rig.model.jnt_dofadr[ids]
+        inertia = rig.model.dof_M0[rig.model.jnt_dofadr[own]]
+        # the stiffest spring that the step resolves: omega h < 0.5
+        rotor = np.maximum(rig.model.dof_armature[rig.model.jnt_dofadr[own]], 1e-3 * inertia)
+        reduced = 1 / (1 / rotor + 1 / np.maximum(inertia - rotor, 1e-3 * inertia))
+        stiffest = 0.25 * reduced / rig.timestep**2
+        stiffness = 1 / np.maximum(values[:, :, 0], 1 / stiffest)
+        rig.array("jnt_stiffness")[:, ids] = stiffness
+        rig.array("dof_damping")[:, dofs] = np.minimum(RELAXATION * stiffness, 0.5 * reduced / rig.timestep)
+
+
+@dataclass(frozen=True)
+class JointComplianceMotor(JointCompliance):
+    """The joint's own damping stays on the motor."""
+
+    variant: ClassVar[str] = "motor"

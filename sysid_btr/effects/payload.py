@@ -1,0 +1,82 @@
+"""A load that a body carries: a point mass at a place in the body's frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.effects.base import Effect, Probe
+from sysid_btr.models.modifier import Kind, Rig
+from sysid_btr.models.scales import JointScale
+
+
+@dataclass(frozen=True)
+class Payload(Effect):
+    """Native: the body's mass, centre of mass and inertia are those of body and load together.
+
+    The parameters are the mass and the position of the load in the frame of the body, whose origin is
+    the joint it hangs on where the model follows the usual convention.
+    """
+
+    name: ClassVar[str] = "payload"
+    title: ClassVar[str] = "payload"
+    scope: ClassVar = "body"
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("mass", "kg", 0.0, 0.0, 2.0, 0.05),
+        *(Kind(axis, "m", 0.0, -0.3, 0.3, 0.02) for axis in "xyz"),
+    )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("mass", "nothing, where the load sits at the body's centre of mass"),
+        ("com_offset", "a free base, or fast motion"),
+        ("joint_spring", "the same joint angle in another orientation to gravity"),
+    )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        m, d = 0.05, 0.05
+        return (((m, 0.0, 0.0, 0.0), (m, d, 0.0, 0.0), (m, 0.0, d, 0.0), (m, 0.0, 0.0, d)),)
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        mass, inertia = rig.array("body_mass"), rig.array("body_inertia")
+        ipos, iquat = rig.array("body_ipos"), rig.array("body_iquat")
+        for place, name in enumerate(self.places):
+            body = rig.model.body(name).id
+            added, where = values[:, place, 0], values[:, place, 1:]
+            loaded = added > 0
+            if not loaded.any():
+                continue
+            own, centre = mass[:, body].copy(), ipos[:, body].copy()
+            total = own + added
+            joint = (own[:, None] * centre + added[:, None] * where) / total[:, None]
+            rotation = _matrices(iquat[:, body])
+            tensor = np.einsum("mij,mj,mkj->mik", rotation, inertia[:, body], rotation)
+            tensor = tensor + _point(own, centre - joint) + _point(added, where - joint)
+            principal, axes = np.linalg.eigh(tensor)
+            axes[np.linalg.det(axes) < 0, :, 0] *= -1
+            mass[:, body] = total
+            ipos[:, body] = joint
+            inertia[loaded, body] = principal[loaded]
+            iquat[loaded, body] = _quaternions(axes[loaded])
+
+
+def _point(mass: FloatArray, r: FloatArray) -> FloatArray:
+    """Inertia (m, 3, 3) of point masses at r about the origin."""
+    square = np.einsum("mi,mi->m", r, r)
+    outer = np.einsum("mi,mj->mij", r, r)
+    result: FloatArray = mass[:, None, None] * (square[:, None, None] * np.eye(3) - outer)
+    return result
+
+
+def _matrices(quaternions: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())
+
+
+def _quaternions(matrices: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(matrices).as_quat(scalar_first=True))

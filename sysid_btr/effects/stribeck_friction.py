@@ -1,0 +1,59 @@
+"""Stribeck friction: dry friction that is larger at rest than in motion.
+
+F(v) = F_c + F_s exp(-(v / v_s)^2) (Armstrong-Helouvry, Dupont, Canudas de Wit 1994,
+doi:10.1016/0005-1098(94)90209-7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.effects.base import Effect, Probe
+from sysid_btr.models.modifier import Kind, Step
+from sysid_btr.models.scales import JointScale
+
+
+@dataclass(frozen=True)
+class StribeckFriction(Effect):
+    """Law: friction follows the velocity at the middle of each step."""
+
+    name: ClassVar[str] = "stribeck_friction"
+    title: ClassVar[str] = "friction that falls with speed"
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("coulomb", "Nm", 0.0, 0.0, 10.0, 0.05),
+        Kind("static", "Nm", 0.0, 0.0, 10.0, 0.05),
+        Kind("velocity", "rad/s", 0.1, 0.01, 3.0, 0.05),
+    )
+    main: ClassVar[int] = 1
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("coulomb_friction", "slow motion below the Stribeck velocity"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        peak, size = max(scale.torque_peak, 1e-9), 0.15 * scale.torque_rms
+        speed = 0.2 * scale.velocity_rms
+        return (
+            Kind("coulomb", scale.unit("Nm"), 0.0, 0.0, peak, size),
+            Kind("static", scale.unit("Nm"), 0.0, 0.0, peak, size),
+            Kind("velocity", scale.unit("rad/s"), speed, 0.02 * speed, 20 * speed, 0.5 * speed),
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        coulomb, static, speed = cls.sized(scale)
+        return tuple(
+            (
+                (2 * coulomb.scale, 0.0, factor * speed.nominal),
+                (0.0, 2 * static.scale, factor * speed.nominal),
+            )
+            for factor in (0.3, 1.0, 3.0)
+        )
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        speed = step.qvel[:, index] / values[:, :, 2]
+        step.friction[:, index] += values[:, :, 0] + values[:, :, 1] * np.exp(-np.square(speed))

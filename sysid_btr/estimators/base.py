@@ -1,0 +1,217 @@
+"""The one contract between problems (what is fitted) and estimators (how)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Protocol, TypeGuard, runtime_checkable
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.errors import UsageError
+
+if TYPE_CHECKING:
+    from sysid_btr.estimators.journal import Journal
+
+
+class Problem(Protocol):
+    """A loss over a box of ``p`` parameters, evaluated for many candidates at once.
+
+    Bounds are finite, ``lower < upper``, and ``start`` lies within them.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names, length ``p``."""
+        ...
+
+    @property
+    def lower(self) -> FloatArray:
+        """Lower bounds, shape ``(p,)``."""
+        ...
+
+    @property
+    def upper(self) -> FloatArray:
+        """Upper bounds, shape ``(p,)``."""
+        ...
+
+    @property
+    def start(self) -> FloatArray:
+        """Where a search begins, shape ``(p,)``."""
+        ...
+
+    def loss(self, candidates: FloatArray) -> FloatArray:
+        """Losses ``(m,)`` of candidates ``(m, p)``; non-finite marks a candidate that failed."""
+        ...
+
+
+class ResidualProblem(Problem, Protocol):
+    """A problem whose loss is a sum of squares."""
+
+    def residuals(self, candidates: FloatArray) -> FloatArray:
+        """Whitened residuals ``(m, r)`` of candidates ``(m, p)``; ``loss`` is their sum of squares.
+
+        The row of a failed candidate is all NaN; no other entry is NaN.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a fit may spend; None means no limit.
+
+    Parameters
+    ----------
+    evaluations
+        Candidates simulated, those replayed from a journal included.
+    seconds
+        Wall time, that of the runs being resumed included. Checked before each batch.
+    """
+
+    evaluations: int | None = None
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.evaluations is not None and self.evaluations < 1:
+            raise UsageError(f"a budget of {self.evaluations} evaluations buys nothing: give at least 1")
+        if self.seconds is not None and not self.seconds > 0.0:
+            raise UsageError(f"a budget of {self.seconds} s buys nothing: give a positive time")
+
+
+class Progress(Protocol):
+    """Called after every batch of evaluations."""
+
+    def __call__(self, *, done: int, total: int | None, best: float, note: str) -> None:
+        """Report `done` of `total` candidates (None: no limit), the best loss so far, and what is going
+        on."""
+        ...
+
+
+def silent(*, done: int, total: int | None, best: float, note: str) -> None:
+    """Progress that reports nothing."""
+
+
+class Termination(Enum):
+    """Why a fit ended; each value is a sentence that can be shown to the user."""
+
+    CONVERGED = "Converged: no step within the tolerance lowers the loss further."
+    BUDGET_SPENT = "The budget was spent before the fit converged: raise it, or resume from the journal with a larger one."
+    ITERATION_LIMIT = (
+        "The iteration limit was reached while the loss was still falling: raise the limit, "
+        "or begin from a better start."
+    )
+    INTERRUPTED = "Interrupted: the best parameters so far are returned, and the journal can be resumed."
+    STALLED = (
+        "Stalled: the derivatives promise a lower loss but no step finds one. The loss is rough near this point: "
+        "smooth it (shorter windows, softer contacts) or use an estimator without derivatives."
+    )
+    GAVE_UP = "The search gave up before it converged: begin from a better start, or use another estimator."
+    NO_FINITE_CANDIDATE = (
+        "No candidate could be simulated to a finite loss: check the model and the log at the start values, "
+        "or narrow the bounds."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """What an estimator found.
+
+    Attributes
+    ----------
+    x
+        Best parameters, shape ``(p,)``; the problem's start if no candidate was finite.
+    loss
+        Loss at `x`.
+    evaluations
+        Candidates simulated, those replayed from a journal included.
+    termination
+        Why the fit ended.
+    converged
+        Whether the estimator's own criterion of convergence was met.
+    at_bound
+        Parameters within 1e-6 of their range from a bound, shape ``(p,)``.
+    jacobian
+        Derivatives of the whitened residuals at `x`, per unit of each parameter, shape ``(r, p)``, or None.
+    residual
+        Whitened residuals at `x`, shape ``(r,)``, or None.
+    history
+        ``(evaluations, best loss)`` at each improvement.
+    seconds
+        Wall time, earlier runs of a resumed journal included.
+    names
+        Parameter names.
+    """
+
+    x: FloatArray
+    loss: float
+    evaluations: int
+    termination: Termination
+    converged: bool
+    at_bound: BoolArray
+    jacobian: FloatArray | None
+    residual: FloatArray | None
+    history: tuple[tuple[int, float], ...]
+    seconds: float
+    names: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """Something that minimises a problem's loss. `sysid_btr.testing.check_estimator` says what that asks."""
+
+    @property
+    def name(self) -> str:
+        """The name it is registered under."""
+        ...
+
+    def fit(
+        self,
+        problem: Problem,
+        *,
+        rng: np.random.Generator,
+        budget: Budget,
+        journal: Journal,
+        progress: Progress,
+    ) -> FitResult:
+        """Minimise ``problem.loss`` within its bounds."""
+        ...
+
+
+def has_residuals(problem: Problem) -> TypeGuard[ResidualProblem]:
+    """Whether the problem hands out residuals, not only losses."""
+    return callable(getattr(problem, "residuals", None))
+
+
+def require_residuals(problem: Problem, estimator: str) -> ResidualProblem:
+    """The problem as one with residuals, or a `UsageError` that names the alternatives."""
+    if not has_residuals(problem):
+        raise UsageError(
+            f"estimator {estimator!r} needs an objective with residuals, and this one gives only a loss: choose a "
+            "least-squares objective, or an estimator that needs none ('cmaes', 'nlopt:LN_BOBYQA', 'ga')"
+        )
+    return problem
+
+
+@dataclass(frozen=True, eq=False)
+class UnitBox:
+    """The affine map between a problem's bounds and the unit cube; it makes steps dimensionless."""
+
+    lower: FloatArray
+    upper: FloatArray
+
+    @property
+    def span(self) -> FloatArray:
+        """Width of the bounds, shape ``(p,)``."""
+        return self.upper - self.lower
+
+    def enter(self, x: FloatArray) -> FloatArray:
+        """Physical values to the unit cube; broadcasts over leading axes."""
+        unit: FloatArray = np.clip((x - self.lower) / self.span, 0.0, 1.0)
+        return unit
+
+    def leave(self, u: FloatArray) -> FloatArray:
+        """Unit cube to physical values; 0 and 1 give the bounds exactly."""
+        inside = np.where(u >= 1.0, self.upper, self.lower + u * self.span)
+        x: FloatArray = np.clip(inside, self.lower, self.upper)
+        return x

@@ -1,0 +1,474 @@
+"""Batched Gauss-Newton / Levenberg-Marquardt least squares in a box.
+
+One iteration is two batches: the finite-difference stencil of all parameters, and a ladder of damping factors
+of which the best is taken. Both are what a parallel simulator does well. Steps are solutions of the damped
+linear problem *with* the bounds, so an active bound never spoils a step.
+
+Residuals are long and parameters few: an iteration keeps only the normal matrix ``J^T J`` and ``J^T r``, and
+the journal records those. Steps are taken in the unit cube of the bounds, with columns scaled to unit length
+(Marquardt 1963, doi:10.1137/0111030); directions the residuals do not see are cut from the spectrum, so
+parameters that cannot be told apart stay where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.errors import SysidError, UsageError
+from sysid_btr.estimators.base import (
+    Budget,
+    FitResult,
+    Problem,
+    Progress,
+    ResidualProblem,
+    Termination,
+    UnitBox,
+    require_residuals,
+    silent,
+)
+from sysid_btr.estimators.evaluator import Evaluator, Outcome, drive
+from sysid_btr.estimators.journal import Journal
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+
+_SMALLEST_CHANGE = (
+    1e-6  # of the residual norm: a stencil that changes less is widened, to stay above round-off
+)
+_WIDEST_STEP = 1e-2  # of the bounds' range
+_STD_FRACTION = 1e-2  # a step shorter than 0.1 std lowers the loss by less than this times loss / r
+_ROUGH_FRACTION = 1e-1  # tolerated instead where no step lowers the loss: 0.3 std
+_LOSS_MISMATCH = 1e-6
+_FIRST_DAMPING = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class _Stencil:
+    """Finite differences about one point: which candidates, and how their residuals make a Jacobian.
+
+    `offsets` (p, k) are displacements in the unit cube, k = 1 (forward) or 2 (central, or one-sided at a
+    bound).
+    """
+
+    base: FloatArray
+    offsets: FloatArray
+
+    @classmethod
+    def forward(cls, u: FloatArray, steps: FloatArray) -> _Stencil:
+        """One displaced candidate a parameter; `steps` are signed, and flipped where they would leave the
+        box."""
+        inside = (u + steps >= 0.0) & (u + steps <= 1.0)
+        return cls(u, np.where(inside, steps, -steps)[:, None])
+
+    @classmethod
+    def central(cls, u: FloatArray, steps: FloatArray) -> _Stencil:
+        """Two displaced candidates a parameter, error of second order also at a bound."""
+        h = np.abs(steps)
+        low, high = u - h < 0.0, u + h > 1.0
+        first = np.where(low, h, -h)
+        second = np.where(low, 2.0 * h, np.where(high, -2.0 * h, h))
+        return cls(u, np.stack([first, second], axis=1))
+
+    def candidates(self) -> FloatArray:
+        """The point itself, then the displaced ones, shape ``(1 + p k, p)``, in the unit cube."""
+        p, k = self.offsets.shape
+        rows = np.repeat(self.base[None], 1 + p * k, axis=0)
+        rows[np.arange(1, 1 + p * k), np.repeat(np.arange(p), k)] += self.offsets.ravel()
+        return rows
+
+    def columns(self, rows: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Derivatives ``(p, r)`` per unit of the cube, and which parameters had no finite neighbour
+        ``(p,)``."""
+        p, k = self.offsets.shape
+        base = rows[0]
+        columns = np.zeros((p, rows.shape[1]))
+        failed = np.zeros(p, dtype=bool)
+        finite = np.isfinite(rows[1:].sum(axis=1)).reshape(p, k)
+        for j in range(p):
+            usable = np.flatnonzero(finite[j])
+            a = self.offsets[j, usable]
+            changes = [rows[1 + j * k + i] - base for i in usable]
+            if len(usable) == 2:  # the derivative at 0 of the parabola through 0, a0, a1
+                weights = np.array([a[1] / a[0], -a[0] / a[1]]) / (a[1] - a[0])
+                columns[j] = weights[0] * changes[0] + weights[1] * changes[1]
+            elif len(usable) == 1:
+                columns[j] = changes[0] / a[0]
+            else:
+                failed[j] = True
+        return columns, failed
+
+
+@dataclass(frozen=True)
+class _Scheme:
+    """How to differentiate, and how far to believe the result."""
+
+    stencil: Callable[[FloatArray, FloatArray], _Stencil]
+    central: bool
+    rank_tolerance: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """The quadratic model of the loss about one point of the unit cube.
+
+    ``loss(u + d) ~ loss + 2 gradient.d + d.normal.d``
+    """
+
+    loss: float
+    gradient: FloatArray
+    normal: FloatArray
+    failed: BoolArray
+    faint: BoolArray
+    residuals: int
+    attachment: Callable[[], FloatArray]
+
+    def predicted(self, d: FloatArray) -> float:
+        """Decrease of the loss the model promises for a step, shape ``(p,)``."""
+        return float(-(2.0 * self.gradient @ d + d @ self.normal @ d))
+
+    def step(self, damping: float, low: FloatArray, high: FloatArray, rank_tolerance: float) -> FloatArray:
+        """Minimiser of the damped model within ``low <= d <= high``."""
+        scale = np.sqrt(np.diag(self.normal))
+        scale[scale == 0.0] = 1.0
+        matrix = self.normal / np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(matrix)
+        keep = values > rank_tolerance**2 * max(values[-1], np.finfo(float).tiny)
+        if not keep.any():
+            return np.zeros_like(self.gradient)
+        # J^T J = V w V^T and J^T r = g: the same least-squares problem with at most p rows is A d = b.
+        root = np.sqrt(values[keep])
+        a = root[:, None] * vectors[:, keep].T
+        b = -(vectors[:, keep].T @ (self.gradient / scale)) / root
+        if damping > 0.0:
+            a = np.vstack([a, np.sqrt(damping) * np.eye(len(scale))])
+            b = np.append(b, np.zeros(len(scale)))
+        return np.clip(_bounded_least_squares(a, b, low * scale, high * scale) / scale, low, high)
+
+
+def _bounded_least_squares(a: FloatArray, b: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    d = np.asarray(np.linalg.lstsq(a, b, rcond=None)[0], dtype=np.float64)
+    if np.all((d >= low) & (d <= high)):
+        return d
+    from scipy.optimize import lsq_linear
+
+    solution = lsq_linear(a, b, bounds=(low, high), method="bvls", max_iter=20 * len(low))
+    return np.asarray(solution.x, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Where a descent ended, and why."""
+
+    u: FloatArray
+    loss: float
+    steps: FloatArray
+    termination: Termination
+    model: _Linear | None = None
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """Levenberg-Marquardt on batched finite differences, within bounds.
+
+    Forward differences lead to the minimum (``p + 1`` candidates and the ladder an iteration); central ones
+    (``2 p + 1``) confirm it, and give the Jacobian of the result.
+
+    Parameters
+    ----------
+    tolerance
+        Converged when the decrease of the loss that the linear model still promises is below this fraction of
+        the loss. Where the residuals are so many that this would leave a step longer than a tenth of a
+        standard deviation, it is tightened to that.
+    step_tolerance
+        Converged when the Gauss-Newton step is shorter than this fraction of every parameter's range.
+    forward_step, central_step
+        Finite-difference steps, fractions of the range. Widened for a parameter whose residuals hardly
+        change.
+    damping
+        The ladder: Levenberg-Marquardt factors, rising, relative to the one that worked last. The undamped
+        step is always tried too. Factors multiply the squared column norms.
+    rescue
+        A second ladder, relative to the last of the first, tried when that lowers nothing.
+    forward_rank_tolerance, central_rank_tolerance
+        Directions whose singular value, columns at unit length, is below this fraction of the largest are not
+        moved. The error of the differences hides what lies below.
+    max_iterations
+        Iterations with forward differences from each start, and again with central ones.
+    n_starts
+        Points to descend from: the problem's start, then `starts`, then random ones.
+    starts
+        Further points to descend from, in the parameters' units.
+    prescreen
+        Random candidates simulated for each random start wanted; the best are taken.
+
+    Notes
+    -----
+    Method: Nocedal and Wright, Numerical Optimization (2006), ch. 10, doi:10.1007/978-0-387-40065-5.
+    """
+
+    tolerance: float = 1e-6
+    step_tolerance: float = 1e-7
+    forward_step: float = 1e-4
+    central_step: float = 3e-4
+    damping: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0)
+    rescue: tuple[float, ...] = (10.0, 1e2, 1e3, 1e5)
+    forward_rank_tolerance: float = 1e-4
+    central_rank_tolerance: float = 1e-6
+    max_iterations: int = 30
+    n_starts: int = 1
+    starts: tuple[tuple[float, ...], ...] = ()
+    prescreen: int = 8
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1 or self.n_starts < 1 or self.prescreen < 1:
+            raise UsageError("lsq: max_iterations, n_starts and prescreen must be at least 1")
+        if not self.damping or min(self.damping + self.rescue) <= 0.0:
+            raise UsageError("lsq: damping needs at least one factor, and all factors above 0")
+        if not (0.0 < self.forward_step <= _WIDEST_STEP and 0.0 < self.central_step <= _WIDEST_STEP):
+            raise UsageError(
+                f"lsq: finite-difference steps are fractions of the range in (0, {_WIDEST_STEP:g}]"
+            )
+
+    @property
+    def name(self) -> str:
+        """``lsq``."""
+        return "lsq"
+
+    def fit(
+        self, problem: Problem, *, rng: Generator, budget: Budget, journal: Journal, progress: Progress
+    ) -> FitResult:
+        """Minimise the sum of squared residuals of `problem`.
+
+        `rng` is drawn from only for random starts. Where the fit ends by itself, the result carries residual
+        and Jacobian at `x`.
+
+        Raises
+        ------
+        UsageError
+            The problem has no residuals, or its bounds or the starts cannot be used.
+        """
+        residual_problem = require_residuals(problem, self.name)
+
+        def search(evaluator: Evaluator) -> Outcome:
+            return self._search(residual_problem, evaluator, rng)
+
+        return drive(problem, search, budget=budget, journal=journal, progress=progress)
+
+    def _search(self, problem: ResidualProblem, evaluator: Evaluator, rng: Generator) -> Outcome:
+        box = evaluator.box
+        starts = self._choose_starts(evaluator, rng)
+        if not starts:
+            return Outcome(Termination.NO_FINITE_CANDIDATE)
+        steps = np.full(len(box.lower), self.forward_step)
+        forward = _Scheme(_Stencil.forward, central=False, rank_tolerance=self.forward_rank_tolerance)
+        central = _Scheme(_Stencil.central, central=True, rank_tolerance=self.central_rank_tolerance)
+        ends = [self._descend(problem, evaluator, u, loss, steps, forward) for u, loss in starts]
+        best = min(ends, key=lambda end: end.loss)
+        steps = np.minimum(np.abs(best.steps) * self.central_step / self.forward_step, _WIDEST_STEP)
+        end = self._descend(problem, evaluator, best.u, best.loss, steps, central)
+        x = box.leave(end.u)
+        if end.model is None:
+            return Outcome(end.termination, x, end.loss)
+        residual, jacobian = _unpack(end.model, box)
+        return Outcome(end.termination, x, end.loss, jacobian, residual)
+
+    def _choose_starts(self, evaluator: Evaluator, rng: Generator) -> list[tuple[FloatArray, float]]:
+        box = evaluator.box
+        given = np.vstack([evaluator.start, *(np.array(start, dtype=np.float64) for start in self.starts)])
+        if np.any(given < box.lower) or np.any(given > box.upper):
+            raise UsageError("lsq: a start lies outside the parameters' bounds")
+        wanted = max(0, self.n_starts - len(given))
+        pool = _latin_hypercube(rng, wanted * self.prescreen, len(box.lower))
+        u = np.vstack([box.enter(given), pool])
+        losses = evaluator.loss(box.leave(u), "choosing starts")
+        order = np.argsort(losses[len(given) :], kind="stable")[:wanted] + len(given)
+        chosen = [i for i in (*range(len(given)), *order) if np.isfinite(losses[i])]
+        if chosen:
+            return [(u[i], float(losses[i])) for i in chosen]
+        # Nothing given can be simulated: look in ever smaller neighbourhoods of the start.
+        for reach in (1.0, 0.3, 0.1, 0.03):
+            near = u[0] + reach * (_latin_hypercube(rng, self.prescreen, len(box.lower)) - u[0])
+            losses = evaluator.loss(box.leave(near), "looking for a start that can be simulated")
+            i = int(np.argmin(losses))
+            if np.isfinite(losses[i]):
+                return [(near[i], float(losses[i]))]
+        return []
+
+    def _descend(
+        self,
+        problem: ResidualProblem,
+        evaluator: Evaluator,
+        u: FloatArray,
+        loss: float,
+        steps: FloatArray,
+        scheme: _Scheme,
+    ) -> _Point:
+        ladder, slow = self._ladder(_FIRST_DAMPING, trust=False), 0
+        for iteration in range(1, self.max_iterations + 1):
+            note = f"iteration {iteration}"
+            model, steps = _linearise(problem, evaluator, u, steps, scheme, note)
+            if abs(model.loss - loss) > _LOSS_MISMATCH * loss + np.finfo(float).tiny:
+                raise SysidError(
+                    f"the objective is inconsistent: simulated twice at the same parameters, its loss was "
+                    f"{loss:.9g}, then the sum of its squared residuals {model.loss:.9g}"
+                )
+            full = model.step(0.0, -u, 1.0 - u, scheme.rank_tolerance)
+            promised = model.predicted(full)
+            tolerance = min(self.tolerance, _STD_FRACTION / model.residuals)
+            short = bool(np.max(np.abs(full)) < self.step_tolerance)
+            if short or promised <= tolerance * loss:
+                blind = model.failed.any()
+                return _Point(u, loss, steps, Termination.STALLED if blind else Termination.CONVERGED, model)
+            found = _climb(evaluator, model, u, loss, scheme.rank_tolerance, ladder, note)
+            rough = promised <= max(tolerance, _ROUGH_FRACTION / model.residuals) * loss
+            halted = Termination.CONVERGED if rough and not model.failed.any() else Termination.STALLED
+            if found is None:
+                return _Point(u, loss, steps, halted, model)
+            new_u, new_loss, factor = found
+            ladder = self._ladder(factor or _FIRST_DAMPING, trust=factor == 0.0)
+            slow = slow + 1 if loss - new_loss < tolerance * loss else 0
+            if slow == 2:
+                # Two steps without a gain worth having: stay where the model was made.
+                return _Point(u, loss, steps, halted, model)
+            u, loss = new_u, new_loss
+        return _Point(u, loss, steps, Termination.ITERATION_LIMIT)
+
+    def _ladder(self, centre: float, *, trust: bool) -> tuple[FloatArray, ...]:
+        """Damping factors about the one that worked last, in the batches to try them in."""
+        first = np.append(0.0, centre * np.array(self.damping))
+        # Once undamped steps work they go on working: two candidates do, and the rest is kept for when not.
+        batches = (first[:2], first[2:]) if trust else (first,)
+        return (*batches, first[-1] * np.array(self.rescue))
+
+
+def _climb(
+    evaluator: Evaluator,
+    model: _Linear,
+    u: FloatArray,
+    loss: float,
+    rank_tolerance: float,
+    ladder: tuple[FloatArray, ...],
+    note: str,
+) -> tuple[FloatArray, float, float] | None:
+    """The best point of the first batch that lowers the loss, its loss and its damping; None if no batch
+    does."""
+    for factors in ladder:
+        if not len(factors):
+            continue
+        steps = [model.step(float(factor), -u, 1.0 - u, rank_tolerance) for factor in factors]
+        trials = np.clip(u + np.array(steps), 0.0, 1.0)
+        losses = evaluator.loss(evaluator.box.leave(trials), note)
+        i = int(np.argmin(losses))
+        if losses[i] < loss:
+            return trials[i], float(losses[i]), float(factors[i])
+    return None
+
+
+def linearise(
+    problem: Problem, x: FloatArray, *, step: float = LeastSquares.central_step
+) -> tuple[FloatArray, FloatArray]:
+    """Residual and Jacobian at a point, by central differences of ``2 p + 1`` candidates.
+
+    Parameters
+    ----------
+    problem
+        Must have residuals.
+    x
+        Shape ``(p,)``, within the bounds.
+    step
+        Finite-difference step, fraction of each parameter's range.
+
+    Returns
+    -------
+    residual, jacobian
+        Shapes ``(r,)`` and ``(r, p)``; the column of a parameter whose neighbours all failed is NaN.
+
+    Raises
+    ------
+    UsageError
+        The problem has no residuals, or none that are finite at `x`.
+    """
+    residual_problem = require_residuals(problem, "lsq")
+    evaluator = Evaluator(problem, budget=Budget(), journal=Journal(), progress=silent)
+    u = evaluator.box.enter(x)
+    central = _Scheme(_Stencil.central, central=True, rank_tolerance=0.0)
+    model, _ = _linearise(residual_problem, evaluator, u, np.full(len(u), step), central, "Jacobian")
+    if not np.isfinite(model.loss):
+        raise UsageError(
+            "there is no Jacobian where the simulation fails: the residuals at this point are not finite"
+        )
+    residual, jacobian = _unpack(model, evaluator.box)
+    return residual, jacobian
+
+
+def _linearise(
+    problem: ResidualProblem,
+    evaluator: Evaluator,
+    u: FloatArray,
+    steps: FloatArray,
+    scheme: _Scheme,
+    note: str,
+) -> tuple[_Linear, FloatArray]:
+    """The model about `u`, and the finite-difference steps for the next one."""
+    for _ in range(3):
+        model = _simulate_stencil(
+            problem, evaluator, scheme.stencil(u, steps), keep=scheme.central, note=note
+        )
+        # A failed neighbour: look closer, and on the other side.
+        closer = np.where(model.failed, -0.25 * steps, steps)
+        wider = np.sign(closer) * np.minimum(10.0 * np.abs(closer), _WIDEST_STEP)
+        steps = np.where(model.faint & ~model.failed, wider, closer)
+        if not scheme.central or not model.failed.any():
+            break
+    return model, steps
+
+
+def _simulate_stencil(
+    problem: ResidualProblem, evaluator: Evaluator, stencil: _Stencil, *, keep: bool, note: str
+) -> _Linear:
+    candidates = evaluator.box.leave(stencil.candidates())
+
+    def reduction(rows: FloatArray) -> tuple[dict[str, FloatArray], FloatArray | None]:
+        columns, failed = stencil.columns(rows)
+        stack = np.vstack([columns, rows[:1]])
+        # einsum, not BLAS: the same bits whatever the number of threads.
+        gram = np.einsum("ir,jr->ij", stack, stack)
+        arrays = {"gram": gram, "failed": failed.astype(np.float64), "size": np.array([float(rows.shape[1])])}
+        if not keep:
+            return arrays, None
+        stack[:-1][failed] = np.nan
+        return arrays, stack
+
+    reduced = evaluator.reduce(problem, candidates, reduction, note)
+    gram, failed = reduced.arrays["gram"], reduced.arrays["failed"] > 0.0
+    change = np.sqrt(np.diag(gram)[:-1]) * np.abs(stencil.offsets).max(axis=1)
+    loss = float(reduced.loss[0])
+    return _Linear(
+        loss=loss,
+        gradient=gram[:-1, -1],
+        normal=gram[:-1, :-1],
+        failed=failed,
+        faint=change < _SMALLEST_CHANGE * np.sqrt(loss),
+        residuals=int(reduced.arrays["size"][0]),
+        attachment=reduced.attachment,
+    )
+
+
+def _unpack(model: _Linear, box: UnitBox) -> tuple[FloatArray, FloatArray]:
+    """Residual ``(r,)`` and Jacobian ``(r, p)`` per unit of each parameter."""
+    stack = model.attachment()
+    jacobian: FloatArray = np.ascontiguousarray((stack[:-1] / box.span[:, None]).T)
+    return stack[-1].copy(), jacobian
+
+
+def _latin_hypercube(rng: Generator, n: int, p: int) -> FloatArray:
+    """``n`` points in the unit cube, one in each of ``n`` slices of every axis
+    (doi:10.1080/00401706.1979.10489755)."""
+    slices = np.array([rng.permutation(n) for _ in range(p)], dtype=np.float64).T.reshape(n, p)
+    points: FloatArray = (slices + rng.random((n, p))) / max(n, 1)
+    return points

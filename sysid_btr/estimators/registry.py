@@ -1,0 +1,97 @@
+"""Estimators by name, built in or installed by other packages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from sysid_btr.errors import UsageError
+from sysid_btr.estimators.base import Estimator
+from sysid_btr.estimators.cma_es import CmaEs
+from sysid_btr.estimators.derivative_free import LOCAL, NLopt
+from sysid_btr.estimators.ga import GeneticAlgorithm
+from sysid_btr.estimators.lsq import LeastSquares
+
+ENTRY_POINTS = "sysid_btr.estimators"
+"""Entry-point group; each entry is a factory: keyword settings to an `Estimator`.
+
+A factory that also takes a text as first argument is given what follows ``:`` in the name.
+"""
+
+Factory = Callable[..., Estimator]
+
+BUILT_IN: Mapping[str, Factory] = {
+    "lsq": LeastSquares,
+    "ga": GeneticAlgorithm,
+    "cmaes": CmaEs,
+    "nlopt": NLopt,
+}
+_WITH_ARGUMENT = {"nlopt": LOCAL[0]}
+
+
+def available() -> tuple[str, ...]:
+    """Names of the estimators installed; ``nlopt:ALGORITHM`` stands for all of NLopt's."""
+    named = (f"{name}:{_WITH_ARGUMENT[name]}" if name in _WITH_ARGUMENT else name for name in BUILT_IN)
+    return (*named, *sorted(set(_installed()) - set(BUILT_IN)))
+
+
+def get_estimator(name: str, **settings: Any) -> Estimator:
+    """The estimator called `name`.
+
+    Parameters
+    ----------
+    name
+        ``lsq``, ``ga``, ``cmaes``, ``nlopt:<algorithm>``, or one installed under the entry-point group
+        `ENTRY_POINTS`.
+    settings
+        Fields of the estimator's class, for example ``max_iterations=5``.
+
+    Raises
+    ------
+    UsageError
+        No such estimator, no such setting, or a value the estimator refuses.
+    """
+    stem, colon, argument = name.partition(":")
+    factory = BUILT_IN.get(stem) or _load(stem)
+    if factory is None:
+        raise UsageError(_unknown(name))
+    if colon and stem in BUILT_IN and stem not in _WITH_ARGUMENT:
+        raise UsageError(f"estimator {stem!r} takes nothing after a colon: write {stem!r}, not {name!r}")
+    if is_dataclass(factory):
+        known = [field.name for field in fields(factory)]
+        wrong = [key for key in settings if key not in known]
+        if wrong:
+            raise UsageError(
+                f"estimator {stem!r} has no setting {', '.join(wrong)}; it has {', '.join(known)}"
+            )
+    estimator: Estimator = factory(argument, **settings) if colon else factory(**settings)
+    return estimator
+
+
+def _installed() -> dict[str, Any]:
+    from importlib.metadata import entry_points
+
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+
+
+def _load(name: str) -> Factory | None:
+    entry = _installed().get(name)
+    if entry is None:
+        return None
+    try:
+        factory: Factory = entry.load()
+    except Exception as error:
+        raise UsageError(
+            f"estimator {name!r} is installed ({entry.value}) but cannot be loaded: {error}"
+        ) from error
+    return factory
+
+
+def _unknown(name: str) -> str:
+    from difflib import get_close_matches
+
+    names = available()
+    close = get_close_matches(name.lower(), names, n=2, cutoff=0.5)
+    hint = f" Did you mean {' or '.join(repr(c) for c in close)}?" if close else ""
+    return f"there is no estimator {name!r}.{hint} There are {', '.join(names)}"

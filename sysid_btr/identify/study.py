@@ -1,0 +1,197 @@
+"""A study: robot, logs, what is fitted and what is held out, ready for estimators and for diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.errors import ModelError
+from sysid_btr.io.log import Log
+from sysid_btr.io.split import holdout_split
+from sysid_btr.models.grammar import parse_parameters
+from sysid_btr.models.modifier import Modifier
+from sysid_btr.models.robot import Robot, joint_names
+from sysid_btr.models.scales import JointScale, Scales
+from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, make_targets
+from sysid_btr.replay.engine import Numerics, Replay
+from sysid_btr.replay.numerics import choose_numerics
+
+TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Data and model of an identification, before anything is estimated.
+
+    Attributes
+    ----------
+    robot : the model.
+    train, holdout : episodes; a held-out part of a training log keeps the samples before it, so that its
+        replay starts where the log does, and scores only what was not fitted.
+    split : (s) for each held-out episode the time from which it is scored.
+    channels : channels that are fitted.
+    numerics : integrator and step; chosen by a convergence check.
+    numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
+    """
+
+    robot: Robot
+    train: tuple[Log, ...]
+    holdout: tuple[Log, ...]
+    split: tuple[float, ...]
+    channels: tuple[str, ...]
+    numerics: Numerics
+    numerics_error: float
+    threads: int = 0
+
+    @cached_property
+    def scales(self) -> Scales:
+        """Sizes of torques and motions at every joint in the plain model on these logs."""
+        return measure_scales(self.robot, self.train, self.numerics, self.threads)
+
+    def declare(self, expressions: Sequence[str]) -> tuple[Modifier, ...]:
+        """Modifiers of the parameters that a user frees."""
+        return parse_parameters(expressions, self.robot, self.scales)
+
+    def train_problem(self, modifiers: Sequence[Modifier], start: FloatArray | None = None) -> ReplayProblem:
+        """What is fitted."""
+        episodes = tuple(
+            self._episode(log, modifiers, self.channels, 0.0, self.train_stop(log)) for log in self.train
+        )
+        return ReplayProblem(episodes, nominal_start(modifiers) if start is None else start)
+
+    def holdout_problem(self, modifiers: Sequence[Modifier]) -> ReplayProblem:
+        """What is predicted without having been fitted."""
+        episodes = tuple(
+            self._episode(log, modifiers, self.channels, begin, np.inf)
+            for log, begin in zip(self.holdout, self.split, strict=True)
+        )
+        return ReplayProblem(episodes, nominal_start(modifiers))
+
+    def train_stop(self, log: Log) -> float:
+        return np.inf
+
+    def _episode(
+        self, log: Log, modifiers: Sequence[Modifier], channels: tuple[str, ...], begin: float, end: float
+    ) -> Episode:
+        robot = self.robot.for_log(log)
+        present = tuple(c for c in channels if any(log.has(c, j) for j in joint_names(robot)))
+        replay = Replay(
+            robot, log, tuple(modifiers), self.numerics, effort="effort" in present, threads=self.threads
+        )
+        targets = make_targets(log, replay.index.joints, present, WARM_UP)
+        if not targets:
+            raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
+        if begin > 0 or np.isfinite(end):
+            time = log.time - log.time[0]
+            targets = tuple(t.window(begin, end, time) for t in targets)
+        return Episode(replay, targets)
+
+
+def nominal_start(modifiers: Sequence[Modifier]) -> FloatArray:
+    """Nominal values of all parameters of some modifiers."""
+    return np.array([p.nominal for m in modifiers for p in m.parameters])
+
+
+def make_study(
+    robot: Robot,
+    logs: Sequence[Log],
+    *,
+    holdout: float | Sequence[Log] = 0.3,
+    channels: Sequence[str] = FITTED,
+    numerics: Numerics | None = None,
+    threads: int = 0,
+) -> Study:
+    """Lay out an identification.
+
+    Parameters
+    ----------
+    robot : model.
+    logs : recordings to fit; each episode is replayed by itself.
+    holdout : the last fraction of each log, or other logs.
+    channels : channels to fit, of ``position``, ``velocity``, ``effort``.
+    numerics : integrator and step; None chooses by a convergence check on the log.
+    threads : worker threads, 0 for all cores.
+
+    Raises
+    ------
+    ModelError
+        If a log and the model have nothing in common.
+    UsageError
+        If the held-out fraction is not between 0 and 1.
+    """
+    episodes = [e for log in logs for e in split_episodes(log)]
+    train: list[Log] = []
+    held: list[Log] = []
+    split: list[float] = []
+    if isinstance(holdout, int | float):
+        for episode in episodes:
+            fitted, _ = holdout_split(episode, float(holdout))
+            train.append(fitted)
+            held.append(episode)
+            split.append(float(episode.time[len(fitted)] - episode.time[0]))
+    else:
+        train = episodes
+        held = [e for log in holdout for e in split_episodes(log)]
+        split = [0.0] * len(held)
+    study = Study(
+        robot=robot,
+        train=tuple(train),
+        holdout=tuple(held),
+        split=tuple(split),
+        channels=tuple(c for c in COMPARED if c in channels),
+        numerics=Numerics("RK4", 0.005),
+        numerics_error=np.nan,
+        threads=threads,
+    )
+    if numerics is None:
+        chosen, error = choose_numerics(robot, study.train[0], threads)
+        return replace(study, numerics=chosen, numerics_error=error)
+    return replace(study, numerics=numerics)
+
+
+def split_episodes(log: Log) -> list[Log]:
+    """Each episode of a log as a log of its own."""
+    borders = np.flatnonzero(np.diff(log.episode) != 0) + 1
+    edges = [0, *borders.tolist(), len(log)]
+    return [log.window(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a > 1]
+
+
+def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, threads: int = 0) -> Scales:
+    """Sizes at every joint, from replays of the plain model."""
+    torque, velocity, acceleration, span = [], [], [], []
+    for log in logs:
+        replay = Replay(robot.for_log(log), log, (), numerics, effort=True, threads=threads)
+        outputs = replay.predict(np.zeros((1, 0)))
+        joints = replay.index.joints
+        assert outputs.effort is not None
+        skip = np.searchsorted(outputs.time, min(WARM_UP, 0.1 * outputs.time[-1]))
+        t, v, q = outputs.effort[0, skip:], outputs.velocity[0, skip:], outputs.position[0, skip:]
+        time = outputs.time[skip:]
+        torque.append(t)
+        velocity.append(v)
+        acceleration.append(np.gradient(v, time, axis=0))
+        span.append(np.ptp(q, axis=0))
+    model = robot.compile()
+    t, v, a = (np.concatenate(x) for x in (torque, velocity, acceleration))
+    reach = np.max(span, axis=0)
+
+    def rms(x: FloatArray) -> FloatArray:
+        return np.sqrt(np.nanmean(np.square(x), axis=0))
+
+    scales = {}
+    for i, joint in enumerate(joints):
+        scales[joint] = JointScale(
+            torque_rms=max(float(rms(t)[i]), TINY),
+            torque_peak=max(float(np.nanmax(np.abs(t[:, i]))), TINY),
+            velocity_rms=max(float(rms(v)[i]), TINY),
+            velocity_peak=max(float(np.nanmax(np.abs(v[:, i]))), TINY),
+            acceleration_rms=max(float(rms(a)[i]), TINY),
+            span=max(float(reach[i]), TINY),
+            slide=int(model.joint(joint).type[0]) == 2,
+        )
+    return scales

@@ -1,0 +1,307 @@
+"""Whether positions follow commands: stuck, swapped, mirrored in sign, late, saturated or dead."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.io._check_units import is_linear
+from sysid_btr.io._text import at, by_channel, mirror_name, runs, some, spread
+from sysid_btr.io._tracking import Tracking, best_lag, driven, moves
+from sysid_btr.io.log import Log
+from sysid_btr.io.problem import Problem
+
+_MOVES_RAD = 0.02
+_MOVES_M = 0.001
+_MAX_LAG = 0.25  # s
+_SEARCHED_LAG = 2.0  # s
+_STUCK_FOR = 0.3  # s
+
+
+def _threshold(log: Log, joint: str) -> float:
+    """Motion worth the name: well above encoder ticks and friction's dead band."""
+    return _MOVES_M if is_linear(log, joint) else _MOVES_RAD
+
+
+def check_motion(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
+    """Problems that show in command and position together, and channels that say nothing."""
+    swapped = _swapped(log, tracking)
+    if swapped:
+        pairs = some([f"{left} and {right}" for left, right in swapped])
+        yield Problem(
+            "joint.swapped",
+            "error",
+            pairs,
+            "left and right look swapped: the position of each follows the command of the other, not its own",
+            "swap the position columns (or the command columns) of these joints; check the rest of that side",
+        )
+    explained = {joint for pair in swapped for joint in pair}
+    flipped = [
+        joint for joint in tracking if joint not in explained and _flipped(log, joint, tracking[joint])
+    ]
+    if flipped:
+        yield Problem(
+            "joint.sign",
+            "error",
+            some(flipped),
+            "the position moves opposite to the command: one of the two has the wrong sign",
+            "negate the column that does not follow the model's joint axis",
+        )
+    yield from _stuck(log)
+    yield from _late(log, {j: t for j, t in tracking.items() if j not in explained and j not in flipped})
+    yield from _dead(log)
+    yield from _clipped_sensors(log)
+
+
+# --- left and right, sign, lag ------------------------------------------------------------------------------
+
+
+def _misfit(command: Tracking, position: Tracking, lag: int) -> float:
+    """Mean square distance of a position to a command, offsets included."""
+    a, b = command.at_lag(lag, position)
+    return float(np.mean((a - b) ** 2)) if len(a) else np.inf
+
+
+def _swapped(log: Log, tracking: Mapping[str, Tracking]) -> list[tuple[str, str]]:
+    found: list[tuple[str, str]] = []
+    for left, a in tracking.items():
+        right = mirror_name(left)
+        if right is None or right not in tracking:
+            continue
+        b = tracking[right]
+        if not (moves(a, _threshold(log, left)) and moves(b, _threshold(log, right))):
+            continue
+        # Walking swings both legs alike, half a period apart: a small lag only, and offsets count.
+        lags = range(round(0.1 / a.step) + 1)
+        own = min(_misfit(a, a, lag) + _misfit(b, b, lag) for lag in lags)
+        across = [_misfit(a, b, lag) + _misfit(b, a, lag) for lag in lags]
+        lag = int(np.argmin(across))
+        follows = min(a.correlation(lag, b), b.correlation(lag, a))
+        if across[lag] < 0.25 * own and follows > 0.8:
+            found.append((left, right))
+    return found
+
+
+def _flipped(log: Log, joint: str, pair: Tracking) -> bool:
+    if not moves(pair, _threshold(log, joint)):
+        return False
+    lags = range(round(0.1 / pair.step) + 1)
+    return max(pair.correlation(lag) for lag in lags) < -0.8
+
+
+def _late(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
+    lags: dict[str, float] = {}
+    for joint, pair in tracking.items():
+        if not moves(pair, _threshold(log, joint)):
+            continue
+        normal = max(pair.correlation(lag) for lag in range(round(_MAX_LAG / pair.step) + 1))
+        if normal > 0.85:
+            continue
+        duration = len(pair.command) * pair.step
+        reach = min(_SEARCHED_LAG, duration / 4)
+        lag, r = best_lag(pair, -reach, reach)
+        seconds = lag * pair.step
+        if r > max(0.9, normal + 0.1) and not 0 <= seconds <= _MAX_LAG:
+            lags[joint] = seconds
+    for kind, chosen in (
+        ("late", {joint: lag for joint, lag in lags.items() if lag > 0}),
+        ("early", {joint: lag for joint, lag in lags.items() if lag < 0}),
+    ):
+        if not chosen:
+            continue
+        worst = max(chosen.values(), key=abs)
+        text = (
+            f"the position follows the command {abs(worst):.2f} s late; a servo needs 0.1 s or so"
+            if kind == "late"
+            else f"the position moves {abs(worst):.2f} s before the command says so"
+        )
+        yield Problem(
+            f"joint.{kind}",
+            "warning",
+            some(f"{joint} ({lag:+.2f} s)" for joint, lag in chosen.items()),
+            f"{text}: command and position seem to come from different clocks",
+            "align the two streams before they are merged; if the robot moves to each target over a set time, "
+            "log the interpolated command instead",
+        )
+
+
+# --- stuck, saturated, dead ---------------------------------------------------------------------------------
+
+
+def _constant_runs(values: FloatArray) -> IntArray:
+    """Runs of equal finite values, rows (start, stop), at least 2 samples long."""
+    same = np.diff(values) == 0
+    found = runs(same)
+    found[:, 1] += 1
+    return found
+
+
+def _tick(values: FloatArray) -> float:
+    """Smallest step between different values: the sensor's resolution, or its noise."""
+    steps = np.abs(np.diff(values[np.isfinite(values)]))
+    steps = steps[steps > 1e-12]
+    return float(np.percentile(steps, 5)) if len(steps) else 0.0
+
+
+def _frozen(log: Log, joint: str, command: FloatArray, start: int, stop: int) -> bool:
+    """Whether a constant run is a sensor that stopped, rather than a joint held by friction.
+
+    A joint held by friction comes to rest and leaves smoothly, and shows the sensor's usual noise meanwhile.
+    """
+    values = log.channels[f"position.{joint}"]
+    steps = np.abs(np.diff(values))
+    tick = _tick(values)
+    outside = np.concatenate((steps[:start], steps[stop:]))
+    outside = outside[np.isfinite(outside)]
+    # A robot may wait at rest when the log begins, so this says nothing there.
+    never_still_otherwise = start > 0 and len(outside) > 10 and np.mean(outside == 0) < 0.05
+    before = steps[max(start - 3, 0) : start]
+    moving = outside[outside > 0]
+    quick = max(5 * tick, float(np.median(moving)) if len(moving) else 0.0)
+    in_flight = len(before) == 3 and float(np.median(before)) > quick
+    leap = float(steps[stop - 1]) if stop <= len(steps) else 0.0
+    usual = float(np.percentile(outside, 99)) if len(outside) else 0.0
+    leaps_out = leap > max(5 * tick, 3 * usual)
+    velocity = log.channels.get(f"velocity.{joint}")
+    speeds = velocity is not None and _speeds_through(velocity, log, values, start, stop)
+    within = command[start:stop]
+    path = float(np.nansum(np.abs(np.diff(within))))
+    whole_cycle = spread(within) > 0.9 * spread(command) and path > 1.8 * spread(command)
+    return bool(never_still_otherwise or in_flight or leaps_out or speeds or whole_cycle)
+
+
+def _speeds_through(velocity: FloatArray, log: Log, values: FloatArray, start: int, stop: int) -> bool:
+    """Whether the velocity sensor saw real motion during the run: over a tenth of the position's whole spread."""
+    speed = velocity[start:stop]
+    if not np.all(np.isfinite(speed)):
+        return False
+    speed = np.where(np.abs(speed) > 3 * _tick(velocity), speed, 0.0)  # an offset of a tick is no motion
+    covered = np.cumsum(speed[:-1] * np.diff(log.time[start:stop]))
+    return spread(covered) > 0.1 * spread(values)
+
+
+def _stuck(log: Log) -> Iterator[Problem]:
+    dead: list[str] = []
+    partly: dict[str, str] = {}
+    pinned: dict[str, str] = {}
+    for joint in log.joints("command"):
+        column = f"position.{joint}"
+        if column not in log.channels:
+            continue
+        values = log.channels[column]
+        on = driven(log, joint)
+        command = np.where(on, log.channels[f"command.{joint}"], np.nan)
+        motion = spread(command)
+        if motion <= _threshold(log, joint) or not np.any(np.isfinite(values)):
+            continue
+        if spread(values) == 0:
+            dead.append(joint)
+            continue
+        needed = max(_threshold(log, joint), 8 * _tick(values), 0.15 * motion)
+        extremes = (np.nanmin(values[np.isfinite(values)]), np.nanmax(values[np.isfinite(values)]))
+        longest: tuple[float, int, int] = (0.0, 0, 0)
+        for start, stop in _constant_runs(values):
+            duration = abs(float(log.time[stop - 1] - log.time[start]))
+            if duration < _STUCK_FOR or stop - start < 5 or spread(command[start:stop]) <= needed:
+                continue
+            if _frozen(log, joint, command, int(start), int(stop)):
+                longest = max(longest, (duration, int(start), int(stop)))
+        if longest[0] > 0:
+            _, start, stop = longest
+            moved = spread(command[start:stop])
+            text = f"{joint}, {at(log, start, stop)}: the command moves {moved:.3g}"
+            (pinned if values[start] in extremes else partly)[joint] = text
+    if dead:
+        yield Problem(
+            "position.stuck",
+            "error",
+            by_channel([f"position.{joint}" for joint in dead]),
+            "the position is one constant value for the whole log while the command moves",
+            "check the encoder and its column; if the joint was locked or its servo off, "
+            "log `enabled` or leave the joint out",
+        )
+    if partly:
+        yield Problem(
+            "position.stuck",
+            "error",
+            "; ".join(partly.values()),
+            "the position repeats exactly one value while the command moves: "
+            "the sensor, or the bus it is on, has stopped reporting",
+            "cut this stretch out, or set these positions to NaN",
+        )
+    if pinned:
+        yield Problem(
+            "position.saturated",
+            "warning",
+            "; ".join(pinned.values()),
+            "the position stays exactly at its largest or smallest value while the command moves on: "
+            "a sensor at the end of its scale, or a joint at its stop",
+            "set these positions to NaN if the sensor was at its end; give the model the joint's range if it is a stop",
+        )
+
+
+def _dead(log: Log) -> Iterator[Problem]:
+    silent: list[str] = []
+    unmoved: list[str] = []
+    forces_vary = any(spread(log.channels[f"force.{site}"]) > 0 for site in log.joints("force"))
+    for column, values in log.channels.items():
+        if not np.any(np.isfinite(values)) or spread(values) > 0:
+            continue
+        channel, _, name = column.partition(".")
+        if channel in ("velocity", "effort", "current", "duty"):
+            position = log.channels.get(f"position.{name}", np.zeros(0))
+            if spread(position) > _threshold(log, name):
+                silent.append(column)
+        elif (channel == "imu" and log.meta.mount == "free") or (channel == "force" and forces_vary):
+            silent.append(column)
+        elif channel == "command":
+            position = log.channels.get(f"position.{name}", np.zeros(0))
+            if spread(position[driven(log, name)] if len(position) else position) > 15 * _threshold(
+                log, name
+            ):
+                unmoved.append(name)
+    if silent:
+        yield Problem(
+            "channel.dead",
+            "warning",
+            by_channel(silent),
+            "the column is one constant value while the robot moves: it carries no measurement",
+            "leave it out, or check the sensor and the recorder",
+        )
+    if unmoved:
+        yield Problem(
+            "command.dead",
+            "warning",
+            by_channel([f"command.{joint}" for joint in unmoved]),
+            "the command never changes while the position moves a lot",
+            "check the command column; if the servo was off, log `enabled` or `stiffness`",
+        )
+
+
+def _clipped_sensors(log: Log) -> Iterator[Problem]:
+    clipped: list[str] = []
+    for column, values in log.channels.items():
+        channel = column.partition(".")[0]
+        if channel not in ("imu", "force") or spread(values) == 0:
+            continue
+        finite = values[np.isfinite(values)]
+        # A foot in the air reads zero for long: only the upper end of a force is saturation.
+        ends = [float(finite.max())] if channel == "force" else [float(finite.max()), float(finite.min())]
+        for end in ends:
+            at_end = runs(values == end)
+            at_end = at_end[at_end[:, 1] - at_end[:, 0] >= 3]
+            before = at_end[:, 0] - 1
+            jumps = np.abs(end - values[before[before >= 0]])
+            held = int(np.sum(at_end[:, 1] - at_end[:, 0]))
+            if held >= 10 and len(jumps) and np.median(jumps) > 3 * _tick(values):
+                clipped.append(f"{column} at {end:.4g} ({held} samples)")
+    if clipped:
+        yield Problem(
+            "sensor.saturated",
+            "warning",
+            some(clipped, 8),
+            "the sensor stays exactly at the end of its scale: the true values lie beyond",
+            "set these samples to NaN, or choose a larger measuring range",
+        )

@@ -1,0 +1,375 @@
+"""Reads a Parquet file as far as it can be read, and says everything that stops it at the file level."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.io.log import META_KEYS, SCHEMA_VERSION, Log, LogMeta, closest, is_schema_column
+from sysid_btr.io.problem import Problem
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+METADATA_KEY = b"sysid_btr"
+_MAGIC = b"PAR1"
+_EXAMPLE_META = '{"schema": 1, "robot": "nao", "mount": "fixed", "source": "measured"}'
+_TIME_NAMES = ("t", "timestamp", "stamp", "time_s", "seconds", "sec")
+# First bytes of what people hand over by mistake, and how to call it.
+_SIGNATURES = (
+    (b"\x89HDF", "an HDF5 file"),
+    (b"PK\x03\x04", "a zip archive or .npz file"),
+    (b"\x93NUMPY", "a .npy file"),
+    (b"\x1f\x8b", "a gzip file"),
+    (b"#ROSBAG", "a ROS 1 bag"),
+    (b"\x89MCAP", "an MCAP file"),
+    (b"SQLite format 3", "a SQLite file or ROS 2 bag"),
+    (b"ARROW1", "an Arrow IPC (Feather) file"),
+    (b"<", "an XML file"),
+    (b"{", "a JSON file"),
+)
+
+
+def load(path: str | Path) -> tuple[Log | None, tuple[Problem, ...]]:
+    """Read what can be read of a log.
+
+    Returns
+    -------
+    log : Log or None
+        The log, with defaults in place of metadata that could not be used; None if there is nothing to check.
+    problems : tuple of Problem
+        Problems of the file itself; the content is left to `sysid_btr.io.validation`.
+    """
+    path = Path(path)
+    unreadable = _unreadable(path)
+    if unreadable is not None:
+        return None, (unreadable,)
+    try:
+        table = _read_table(path)
+    except (OSError, ValueError, NotImplementedError) as error:  # pyarrow's errors derive from these
+        problem = Problem(
+            "file.corrupt",
+            "error",
+            str(path),
+            f"the file is Parquet but its content cannot be decoded ({_one_line(error)})",
+            "copy or record the file again; compare its checksum with that of the original",
+        )
+        return None, (problem,)
+    problems: list[Problem] = []
+    meta = _meta(table.schema.metadata or {}, problems)
+    log = _log(table, meta, path, problems)
+    return log, tuple(problems)
+
+
+def _read_table(path: Path) -> pa.Table:
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as file:
+        return file.read()
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _unreadable(path: Path) -> Problem | None:
+    """Why the file is no Parquet file at all, judged by its first and last bytes."""
+
+    def problem(code: str, message: str, remedy: str) -> Problem:
+        return Problem(code, "error", str(path), message, remedy)
+
+    if not path.exists():
+        return problem(
+            "file.missing", "there is no such file", f"check the path; looked in {path.parent.resolve()}"
+        )
+    if not path.is_file():
+        return problem(
+            "file.not_a_file", "this is a folder, not a log", "give one Parquet file, --log once for each"
+        )
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(512)
+            file.seek(max(size - 4, 0))
+            tail = file.read(4)
+    except OSError as error:
+        return problem(
+            "file.unreadable", f"the file cannot be read ({_one_line(error)})", "check its permissions"
+        )
+    if size == 0:
+        return problem("file.empty", "the file has 0 bytes", "record or copy it again")
+    if head.startswith(_MAGIC) and tail == _MAGIC and size >= 12:
+        return None
+    if head.startswith(_MAGIC):
+        return problem(
+            "file.truncated",
+            f"the file begins as Parquet but its end (the footer) is missing after {size} bytes: "
+            "it was cut short, or the recorder did not close it",
+            "copy it again, or close the recorder properly; the footer cannot be rebuilt",
+        )
+    kind = next((name for start, name in _SIGNATURES if head.startswith(start)), None)
+    if kind is None:
+        kind = "a text or CSV file" if _is_text(head) else "something else"
+    return problem(
+        "file.not_parquet",
+        f"this is not a Parquet file: it looks like {kind}",
+        "convert it with `sysid-btr import`, or write a Parquet log (schema 1) yourself",
+    )
+
+
+def _is_text(head: bytes) -> bool:
+    try:
+        head.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return b"\x00" not in head
+
+
+# --- metadata -----------------------------------------------------------------------------------------------
+
+
+def _meta(metadata: Mapping[bytes, bytes], problems: list[Problem]) -> LogMeta:
+    def report(code: str, where: str, message: str, remedy: str) -> None:
+        problems.append(Problem(code, "error", where, message, remedy))
+
+    if METADATA_KEY not in metadata:
+        report(
+            "meta.missing",
+            "file metadata",
+            "the Parquet metadata key `sysid_btr` is missing, so robot, mount and schema version are not known",
+            f"add it with JSON such as {_EXAMPLE_META}, or convert the file with `sysid-btr import`",
+        )
+        return LogMeta()
+    try:
+        raw = json.loads(metadata[METADATA_KEY])
+    except ValueError as error:
+        report(
+            "meta.json",
+            "file metadata `sysid_btr`",
+            f"not valid JSON ({error})",
+            f"write e.g. {_EXAMPLE_META}",
+        )
+        return LogMeta()
+    if not isinstance(raw, dict):
+        report("meta.json", "file metadata `sysid_btr`", "not a JSON object", f"write e.g. {_EXAMPLE_META}")
+        return LogMeta()
+    return parse_meta(raw, problems)
+
+
+def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
+    """Metadata from its JSON object; what cannot be used is reported and replaced by its default."""
+    known: dict[str, Any] = {}
+
+    def accept(key: str, good: bool, allowed: str) -> None:
+        if key not in raw:
+            return
+        if good:
+            known[key] = raw[key]
+        else:
+            problems.append(
+                Problem(
+                    f"meta.{key}",
+                    "error",
+                    f"file metadata, `{key}`",
+                    f"{json.dumps(raw[key])} is not allowed",
+                    f"use {allowed}, or leave `{key}` out",
+                )
+            )
+
+    version = raw.get("schema")
+    if version != SCHEMA_VERSION or isinstance(version, bool):
+        said = (
+            "no schema version is given"
+            if version is None
+            else f"schema version {json.dumps(version)} is unknown"
+        )
+        newer = isinstance(version, int) and version > SCHEMA_VERSION
+        problems.append(
+            Problem(
+                "meta.schema",
+                "error",
+                "file metadata, `schema`",
+                f"{said}; this release reads version {SCHEMA_VERSION}",
+                "update sysid_btr"
+                if newer
+                else f'set "schema": {SCHEMA_VERSION} if the columns follow that schema',
+            )
+        )
+    for key in ("robot", "source", "notes"):
+        accept(key, isinstance(raw.get(key), str), "text")
+    accept("mount", raw.get("mount") in ("fixed", "free"), '"fixed" (the torso was held) or "free"')
+    accept("command_hold", raw.get("command_hold") in ("zoh", "linear"), '"zoh" or "linear"')
+    for key in ("sample_period", "servo_period"):
+        value = raw.get(key)
+        accept(key, value is None or _positive(value), "a positive number of seconds")
+        if known.get(key) is not None:
+            known[key] = float(known[key])
+    units = raw.get("units")
+    accept(
+        "units",
+        isinstance(units, dict) and all(isinstance(unit, str) for unit in units.values()),
+        'an object of channel and unit, e.g. {"position": "rad"}',
+    )
+    extra = {key: value for key, value in raw.items() if key not in META_KEYS}
+    for key in extra:
+        guess = closest(key, META_KEYS)
+        if guess and guess not in raw:
+            problems.append(
+                Problem(
+                    "meta.unknown_key",
+                    "warning",
+                    f"file metadata, `{key}`",
+                    f"the schema has no key `{key}`, so it is kept but not used; did you mean `{guess}`?",
+                    f"rename it to `{guess}` if so",
+                )
+            )
+    return LogMeta(**known, extra=extra)
+
+
+def _positive(value: object) -> bool:
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+    )
+
+
+# --- columns ------------------------------------------------------------------------------------------------
+
+
+def _log(table: pa.Table, meta: LogMeta, path: Path, problems: list[Problem]) -> Log | None:
+    def report(code: str, where: str, message: str, remedy: str) -> None:
+        problems.append(Problem(code, "error", where, message, remedy))
+
+    n = table.num_rows
+    twice = [name for name, count in Counter(table.column_names).items() if count > 1]
+    if twice:
+        report(
+            "column.duplicate",
+            ", ".join(twice),
+            "the file has more than one column of this name, and they may differ",
+            "keep one of each; joints are matched by name",
+        )
+    columns: dict[str, pa.ChunkedArray] = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        columns.setdefault(name, column)
+    if n == 0:
+        report(
+            "log.empty",
+            str(path),
+            f"the log has {len(columns)} columns and no samples",
+            "record again; a log needs some seconds of motion",
+        )
+
+    time = _time(columns, meta, n, problems)
+    episode = _episode(columns, n, problems)
+    channels: dict[str, FloatArray] = {}
+    unknown: dict[str, np.ndarray[Any, Any]] = {}
+    not_numeric: list[str] = []
+    for name, column in columns.items():
+        if name in ("time", "episode"):
+            continue
+        if is_schema_column(name) and _is_numeric(column.type):
+            channels[name] = _floats(column)
+            continue
+        if is_schema_column(name):
+            not_numeric.append(f"{name} ({column.type})")
+        unknown[name] = _values(column)
+    if not_numeric:
+        report(
+            "column.not_numeric",
+            ", ".join(not_numeric),
+            "columns of the schema hold numbers (or booleans), these do not",
+            "convert them to float64, with null or NaN where a value is missing",
+        )
+    if time is None or n == 0:
+        return None
+    return Log(time=time, channels=channels, meta=meta, episode=episode, path=path, unknown=unknown)
+
+
+def _time(
+    columns: Mapping[str, pa.ChunkedArray], meta: LogMeta, n: int, problems: list[Problem]
+) -> FloatArray | None:
+    if "time" in columns and _is_numeric(columns["time"].type):
+        return _floats(columns["time"])
+    if "time" in columns:
+        message, remedy = (
+            f"the column holds {columns['time'].type}, not a number of seconds",
+            "write time as float64 seconds; any origin will do",
+        )
+        problems.append(Problem("time.type", "error", "time", message, remedy))
+    else:
+        guess = closest("time", columns) or next((c for c in columns if c.casefold() in _TIME_NAMES), None)
+        hint = f"; is `{guess}` the time?" if guess else ""
+        problems.append(
+            Problem(
+                "time.missing",
+                "error",
+                "time",
+                f"the log has no column `time`{hint}",
+                "add `time`: float64 seconds, strictly increasing, any origin",
+            )
+        )
+    # With the nominal period the other columns can still be checked in the same pass.
+    return None if meta.sample_period is None else np.arange(n, dtype=np.float64) * meta.sample_period
+
+
+def _episode(columns: Mapping[str, pa.ChunkedArray], n: int, problems: list[Problem]) -> IntArray:
+    if "episode" not in columns:
+        return np.zeros(n, dtype=np.int64)
+    column = columns["episode"]
+    values = _floats(column) if _is_numeric(column.type) else np.full(n, np.nan)
+    if not np.all(np.isfinite(values)) or np.any(values != np.round(values)):
+        problems.append(
+            Problem(
+                "episode.type",
+                "error",
+                "episode",
+                f"the column ({column.type}) does not hold a whole number in every row",
+                "number the episodes 0, 1, 2, ... or leave the column out",
+            )
+        )
+        return np.zeros(n, dtype=np.int64)
+    return values.astype(np.int64)
+
+
+def _is_numeric(kind: pa.DataType) -> bool:
+    from pyarrow import types
+
+    return bool(
+        types.is_integer(kind)
+        or types.is_floating(kind)
+        or types.is_boolean(kind)
+        or types.is_decimal(kind)
+        or types.is_null(kind)
+    )
+
+
+def _floats(column: pa.ChunkedArray) -> FloatArray:
+    """A numeric column as a new float64 array; null becomes NaN."""
+    import pyarrow as pa
+
+    if pa.types.is_boolean(column.type):
+        column = column.cast(pa.int8())
+    values: FloatArray = column.cast(pa.float64()).to_numpy().astype(np.float64, copy=True)
+    return values
+
+
+def _values(column: pa.ChunkedArray) -> np.ndarray[Any, Any]:
+    """Any column as numpy, such that writing it back gives the same column (null stays null)."""
+    import pyarrow as pa
+
+    if pa.types.is_floating(column.type) and column.null_count == 0:
+        return np.array(column.to_numpy())
+    if (pa.types.is_integer(column.type) or pa.types.is_boolean(column.type)) and column.null_count == 0:
+        return np.array(column.to_numpy())
+    if pa.types.is_timestamp(column.type) and column.type.tz is None:
+        return np.array(column.to_numpy())
+    values = np.empty(len(column), dtype=object)
+    values[:] = column.to_pylist()
+    return values

@@ -1,0 +1,219 @@
+"""A log in memory: what one robot was told and what its sensors said, one row a sample."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.errors import LogError
+
+SCHEMA_VERSION = 1
+
+JOINT_CHANNELS = (
+    "command",
+    "position",
+    "velocity",
+    "effort",
+    "current",
+    "voltage",
+    "duty",
+    "temperature",
+    "stiffness",
+    "enabled",
+)
+"""Channels that hold one column a joint."""
+
+IMU_NAMES = ("gyro_x", "gyro_y", "gyro_z", "acc_x", "acc_y", "acc_z", "angle_x", "angle_y")
+"""Names of the ``imu`` channel."""
+
+CHANNELS = (*JOINT_CHANNELS, "imu", "force")
+"""Every channel of the schema; a column is ``<channel>.<name>``."""
+
+
+@dataclass(frozen=True)
+class LogMeta:
+    """What a log says about itself (the JSON under the file's ``sysid_btr`` metadata key).
+
+    Attributes
+    ----------
+    schema : int
+        Version of the log schema; this release reads version 1.
+    robot : str
+        Name of the robot.
+    mount : {"fixed", "free"}
+        Whether the torso was held or free to move.
+    sample_period : float or None
+        Nominal sampling period, s; None for an irregular clock.
+    source : str
+        Where the numbers come from, e.g. ``"measured"``.
+    command_hold : {"zoh", "linear"}
+        What the robot does with a command between two samples.
+    servo_period : float or None
+        Period of the servo's control law, s.
+    units : mapping of str to str
+        Unit by channel (``"position"``) or by column (``"position.slider"``); SI where silent.
+    notes : str
+        Free text.
+    extra : mapping
+        Keys this release does not know; kept and written back.
+    """
+
+    schema: int = SCHEMA_VERSION
+    robot: str = ""
+    mount: Literal["fixed", "free"] = "fixed"
+    sample_period: float | None = None
+    source: str = ""
+    command_hold: Literal["zoh", "linear"] = "zoh"
+    servo_period: float | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    notes: str = ""
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def unit(self, column: str) -> str | None:
+        """Declared unit of a column: its own entry, else its channel's, else None.
+
+        For the IMU the entry ``"imu.gyro"`` stands for its three axes.
+        """
+        channel, _, name = column.partition(".")
+        group = f"imu.{name.partition('_')[0]}" if channel == "imu" else channel
+        return next((self.units[key] for key in (column, group) if key in self.units), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Samples of one recording (or of several, told apart by `episode`).
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        Time of each sample as recorded, s, of any origin.
+    channels : mapping of str to ndarray, shape (n,)
+        Columns of the schema by full name (``"position.HeadYaw"``), SI units, in column order.
+        NaN is a missing value; booleans are 0 and 1.
+    meta : LogMeta
+        What the log says about itself.
+    episode : ndarray of int, shape (n,)
+        Episode of each sample; zeros when the log has no such column.
+    path : Path or None
+        The file the log was read from.
+    unknown : mapping of str to ndarray, shape (n,)
+        Columns that are not of the schema; kept, ignored and written back.
+
+    Raises
+    ------
+    LogError
+        If columns differ in length.
+    """
+
+    time: FloatArray
+    channels: Mapping[str, FloatArray]
+    meta: LogMeta
+    episode: IntArray
+    path: Path | None = None
+    unknown: Mapping[str, np.ndarray[Any, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.time)
+        columns: dict[str, Any] = {"episode": self.episode, **self.channels, **self.unknown}
+        wrong = {name: np.shape(values) for name, values in columns.items() if np.shape(values) != (n,)}
+        if wrong:
+            listing = ", ".join(f"{name} {shape}" for name, shape in wrong.items())
+            raise LogError(f"every column of a log has one value a sample, here ({n},); found {listing}")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def joints(self, channel: str) -> tuple[str, ...]:
+        """Names that have a column in `channel`, in column order."""
+        prefix = f"{channel}."
+        return tuple(column.removeprefix(prefix) for column in self.channels if column.startswith(prefix))
+
+    def has(self, channel: str, name: str) -> bool:
+        """Whether the column ``<channel>.<name>`` exists."""
+        return f"{channel}.{name}" in self.channels
+
+    def array(self, channel: str, names: Sequence[str]) -> FloatArray:
+        """Columns of one channel as a matrix.
+
+        Parameters
+        ----------
+        channel : str
+            A channel of the schema, e.g. ``"position"``.
+        names : sequence of str
+            Joints (or IMU axes, or force sites), in the order wanted.
+
+        Returns
+        -------
+        ndarray, shape (n, len(names))
+            A new array; NaN where a value is missing.
+
+        Raises
+        ------
+        LogError
+            If a column does not exist; the message lists what there is.
+        """
+        there = self.joints(channel)
+        missing = [name for name in names if name not in there]
+        if missing:
+            where = f" ({self.path})" if self.path else ""
+            raise LogError(
+                f"the log{where} has no {channel} for {', '.join(with_hint(name, there) for name in missing)}; "
+                f"its {channel} columns: {', '.join(there) or 'none'}"
+            )
+        if not names:
+            return np.empty((len(self), 0))
+        return np.stack([self.channels[f"{channel}.{name}"] for name in names], axis=1).astype(np.float64)
+
+    def window(self, start: int, stop: int) -> Log:
+        """Samples `start` to `stop` (exclusive, as in a slice), as views of the same arrays."""
+        rows = slice(start, stop)
+        return replace(
+            self,
+            time=self.time[rows],
+            channels={name: values[rows] for name, values in self.channels.items()},
+            episode=self.episode[rows],
+            unknown={name: values[rows] for name, values in self.unknown.items()},
+        )
+
+    def episodes(self) -> tuple[slice, ...]:
+        """Row ranges of the episodes: the runs of equal episode number, in row order."""
+        if len(self) == 0:
+            return ()
+        borders = np.flatnonzero(np.diff(self.episode)) + 1
+        edges = [0, *borders.tolist(), len(self)]
+        return tuple(slice(start, stop) for start, stop in itertools.pairwise(edges))
+
+
+META_KEYS = tuple(f.name for f in fields(LogMeta) if f.name != "extra")
+"""Metadata keys of the schema."""
+
+
+def is_schema_column(name: str) -> bool:
+    """Whether a column name (other than ``time`` and ``episode``) is of the schema."""
+    channel, dot, rest = name.partition(".")
+    if not (dot and rest):
+        return False
+    return rest in IMU_NAMES if channel == "imu" else channel in CHANNELS
+
+
+def closest(name: str, known: Iterable[str], cutoff: float = 0.75) -> str | None:
+    """The known name most like `name`, or None; a difference in letter case alone always matches."""
+    by_folded = {other.casefold(): other for other in known}
+    folded = name.casefold()
+    if folded in by_folded:
+        return by_folded[folded]
+    match = difflib.get_close_matches(folded, by_folded, n=1, cutoff=cutoff)
+    return by_folded[match[0]] if match else None
+
+
+def with_hint(name: str, known: Iterable[str]) -> str:
+    """`name`, followed by the known name it may have meant."""
+    guess = closest(name, known)
+    return f"{name} (did you mean {guess}?)" if guess else name

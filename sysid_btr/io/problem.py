@@ -1,0 +1,48 @@
+"""One thing that is wrong with a log, and how several are told to a person."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something wrong with a log.
+
+    Attributes
+    ----------
+    code : str
+        Stable name of the kind of problem, e.g. ``"time.duplicate"``.
+    severity : {"error", "warning"}
+        An error makes the log unusable as it is; a warning is worth knowing.
+    where : str
+        Column, sample range or time.
+    message : str
+        What is wrong.
+    remedy : str
+        What to do next.
+    """
+
+    code: str
+    severity: Literal["error", "warning"]
+    where: str
+    message: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.severity} [{self.code}] {self.where}: {self.message}\n    -> {self.remedy}"
+
+
+def errors_of(problems: Sequence[Problem]) -> tuple[Problem, ...]:
+    """The problems that make the log unusable."""
+    return tuple(problem for problem in problems if problem.severity == "error")
+
+
+def explain(path: object, problems: Sequence[Problem]) -> str:
+    """Text that lists `problems` of the log at `path`, one numbered entry each."""
+    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    lines = [f"{path} cannot be used: {count}"]
+    lines += [f"  {i}. {problem}" for i, problem in enumerate(problems, start=1)]
+    return "\n".join(lines)

@@ -1,0 +1,48 @@
+"""Training and held-out parts of a log."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid_btr.errors import LogError, UsageError
+from sysid_btr.io._clock import typical_interval
+from sysid_btr.io.log import Log
+
+
+def holdout_split(log: Log, holdout: float = 0.3) -> tuple[Log, Log]:
+    """Split a log in time: the first part to fit, the last to judge the fit.
+
+    Parameters
+    ----------
+    log : Log
+        One or more episodes; their durations add up, jumps of the clock between them do not count.
+    holdout : float
+        Fraction of the time to hold out, between 0 and 1 (both excluded).
+
+    Returns
+    -------
+    train, holdout : Log
+        All samples, in order, none in both. The cut may fall inside an episode.
+
+    Raises
+    ------
+    UsageError
+        If `holdout` is not between 0 and 1.
+    LogError
+        If a part would have fewer than 2 samples.
+    """
+    if not 0 < holdout < 1:
+        raise UsageError(f"the held-out fraction must lie between 0 and 1 (both excluded), not {holdout}")
+    cut = 0
+    if len(log) >= 4:
+        steps = np.diff(log.time)
+        borders = np.flatnonzero(np.diff(log.episode))
+        steps[borders] = typical_interval(log.time)
+        elapsed = np.concatenate(([0.0], np.cumsum(steps)))
+        cut = int(np.searchsorted(elapsed, (1 - holdout) * elapsed[-1] * (1 - 1e-12)))
+    if cut < 2 or len(log) - cut < 2:
+        raise LogError(
+            f"the log has {len(log)} samples: too few to hold out {holdout:g} of it (each part needs 2); "
+            "record more, or give a second log to hold out"
+        )
+    return log.window(0, cut), log.window(cut, len(log))

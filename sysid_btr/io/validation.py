@@ -1,0 +1,91 @@
+"""Everything that is wrong with a log, in one pass, with where it is and what to do about it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from sysid_btr.io._check_clock import check_clock
+from sysid_btr.io._check_columns import check_columns
+from sysid_btr.io._check_motion import check_motion
+from sysid_btr.io._check_units import check_declared_units, check_scale
+from sysid_btr.io._check_values import check_values, plausible
+from sysid_btr.io._file import load
+from sysid_btr.io._tracking import trackings
+from sysid_btr.io.log import Log
+from sysid_btr.io.problem import Problem
+
+__all__ = ["Problem", "validate_file", "validate_log"]
+
+
+def validate_log(
+    log: Log,
+    *,
+    joints: Sequence[str] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+) -> tuple[Problem, ...]:
+    """Problems of a log's content.
+
+    An irregular clock, a clock of any origin, short dropouts and several episodes are no errors. Time must
+    increase strictly within an episode; from one episode to the next the clock may jump or restart.
+
+    Parameters
+    ----------
+    log : Log
+        The log, as read.
+    joints : sequence of str, optional
+        Joints of the model: the log must have them, and those it has besides are pointed out.
+    ranges : mapping of str to (low, high), optional
+        Range of each joint where known, rad or m.
+
+    Returns
+    -------
+    tuple of Problem
+        Errors first; empty for a good log. Problems of one kind in many columns are one entry.
+    """
+    if len(log) == 0:
+        return (
+            Problem("log.empty", "error", "time", "the log has no samples", "record some seconds of motion"),
+        )
+    motion = plausible(log)
+    tracking = trackings(motion)
+    found = [
+        *check_columns(log, joints),
+        *check_clock(log),
+        *check_values(log),
+        *check_declared_units(log),
+        *check_scale(motion, tracking, ranges),
+        *check_motion(motion, tracking),
+    ]
+    return _errors_first(found)
+
+
+def validate_file(
+    path: str | os.PathLike[str],
+    *,
+    joints: Sequence[str] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+) -> tuple[Problem, ...]:
+    """Problems of a log file: those of the file and, as far as it can be read, those of its content.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; one that is missing or unreadable is a problem too, never an exception.
+    joints, ranges
+        As for `validate_log`.
+
+    Returns
+    -------
+    tuple of Problem
+        Errors first; empty for a good log.
+    """
+    log, problems = load(Path(path))
+    if log is not None:
+        problems += validate_log(log, joints=joints, ranges=ranges)
+    return _errors_first(problems)
+
+
+def _errors_first(problems: Sequence[Problem]) -> tuple[Problem, ...]:
+    return tuple(sorted(problems, key=lambda problem: problem.severity != "error"))

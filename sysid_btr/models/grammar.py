@@ -1,0 +1,179 @@
+"""The parameter grammar: ``FIELD:GLOB[,GLOB...][=shared]`` to modifiers of a robot."""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from sysid_btr.errors import UsageError
+from sysid_btr.models.fields import FIELDS, FieldModifier, Scope, nominal_value
+from sysid_btr.models.modifier import Parameter
+from sysid_btr.models.robot import Robot, body_names, joint_names, servo_joints
+from sysid_btr.models.scales import JointScale, Scales
+
+if TYPE_CHECKING:
+    import mujoco
+
+SCOPES: dict[Scope, Callable[[Robot], tuple[str, ...]]] = {
+    "body": body_names,
+    "joint": joint_names,
+    "servo": servo_joints,
+}
+
+
+@dataclass(frozen=True)
+class Declared:
+    """Modifiers of the declared parameters of one expression."""
+
+    expression: str
+    modifiers: tuple[FieldModifier, ...]
+
+
+def parse_parameters(
+    expressions: Sequence[str], robot: Robot, scales: Scales | None = None
+) -> tuple[FieldModifier, ...]:
+    """Modifiers for the parameters that a user frees.
+
+    Parameters
+    ----------
+    expressions : such as ``mass:*Knee*,*HipPitch``, ``kp:*=shared``, ``frictionloss:slider``.
+    robot : names, nominal values, bounds and joints that share a motor.
+    scales : sizes at each joint, for bounds of absolute fields; without them only factors are bounded.
+
+    Raises
+    ------
+    UsageError
+        Naming what does not match, and what there is; all problems at once.
+    """
+    problems: list[str] = []
+    result: list[FieldModifier] = []
+    taken: dict[str, str] = {}
+    for expression in expressions:
+        try:
+            for modifier in _parse_one(expression, robot, scales):
+                for parameter in modifier.parameters:
+                    for key in _keys(parameter.name):
+                        if key in taken:
+                            raise UsageError(f"{key} is already freed by {taken[key]!r}")
+                        taken[key] = expression
+                result.append(modifier)
+        except UsageError as error:
+            problems.append(f"  --fit {expression}: {error}")
+    if problems:
+        raise UsageError("parameters that cannot be used:\n" + "\n".join(problems))
+    return tuple(result)
+
+
+def _keys(name: str) -> list[str]:
+    field, _, places = name.partition(":")
+    return [f"{field}:{place}" for place in places.split(",")]
+
+
+def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[FieldModifier]:
+    field, colon, rest = expression.partition(":")
+    if not colon or not rest:
+        raise UsageError("expected FIELD:GLOB[,GLOB...][=shared], for example mass:*KneePitch or kp:*=shared")
+    if field not in FIELDS:
+        close = difflib.get_close_matches(field, FIELDS, n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise UsageError(f"unknown field {field!r}{hint}; fields are {', '.join(FIELDS)}")
+    globs, equals, option = rest.partition("=")
+    if equals and option != "shared":
+        raise UsageError(f"after '=' only 'shared' is allowed, not {option!r}")
+    cls = FIELDS[field]
+    known = SCOPES[cls.scope](robot)
+    names: list[str] = []
+    for glob in globs.split(","):
+        matched = [n for n in known if fnmatch.fnmatchcase(n, glob)]
+        if not matched:
+            raise UsageError(
+                f"{glob!r} matches no {_scope_noun(cls.scope)} of {robot.name}; there are: {', '.join(known)}"
+            )
+        names += [n for n in matched if n not in names]
+    if option == "shared":
+        return [_build(cls, tuple(names), robot, scales)]
+    return [_build(cls, group, robot, scales) for group in _motors(cls.scope, names, robot)]
+
+
+def _scope_noun(scope: Scope) -> str:
+    return {"body": "body with mass", "joint": "joint", "servo": "joint with a servo", "robot": "robot"}[scope]
+
+
+def _motors(scope: Scope, names: list[str], robot: Robot) -> list[tuple[str, ...]]:
+    """Names one by one, but joints that one motor drives together."""
+    groups: list[tuple[str, ...]] = []
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            continue
+        tied = next((t for t in robot.tied if name in t), (name,)) if scope == "servo" else (name,)
+        groups.append(tuple(t for t in tied if t in names))
+        seen.update(groups[-1])
+    return groups
+
+
+def _build(
+    cls: type[FieldModifier], places: tuple[str, ...], robot: Robot, scales: Scales | None
+) -> FieldModifier:
+    model = robot.compile()
+    bare = cls(places=places, shared=len(places) > 1)
+    known = tuple(
+        _limits(parameter, cls.name, places[0], robot, model, scales) for parameter in bare.parameters
+    )
+    return replace(bare, known=known)
+
+
+def _limits(
+    parameter: Parameter,
+    field: str,
+    place: str,
+    robot: Robot,
+    model: mujoco.MjModel,
+    scales: Scales | None,
+) -> Parameter:
+    """Nominal, bounds, scale and unit of one parameter at one place."""
+    scale = None if scales is None else scales.get(place)
+    nominal = nominal_value(field, model, place) if math.isnan(parameter.nominal) else parameter.nominal
+    size, reach = parameter.scale, math.inf
+    if field in SIZES and scale is not None:
+        size, reach = SIZES[field](scale)
+    if math.isnan(size):
+        size = 0.1 * abs(nominal) if nominal and math.isfinite(nominal) else 1.0
+    if not math.isfinite(reach):
+        reach = 100 * size
+    lower = parameter.lower if math.isfinite(parameter.lower) else -reach
+    upper = parameter.upper if math.isfinite(parameter.upper) else max(reach, 10 * nominal)
+    if not math.isfinite(nominal):
+        nominal = upper
+    lower, upper = _own_bounds(parameter.name, field, place, robot.bounds, (lower, upper))
+    unit = parameter.unit if scale is None else scale.unit(parameter.unit)
+    return Parameter(parameter.name, unit, nominal, lower, upper, size)
+
+
+def _own_bounds(
+    name: str,
+    field: str,
+    place: str,
+    table: Mapping[str, tuple[float, float]],
+    default: tuple[float, float],
+) -> tuple[float, float]:
+    for key in (name, f"{field}:{place}", field):
+        if key in table:
+            return table[key]
+    return default
+
+
+SIZES: dict[str, Callable[[JointScale], tuple[float, float]]] = {
+    "damping": lambda s: (0.1 * s.damping, 5 * s.damping),
+    "quadratic_damping": lambda s: (0.1 * s.damping / s.velocity_rms, 5 * s.damping / s.velocity_rms),
+    "frictionloss": lambda s: (0.1 * s.torque_rms, s.torque_peak),
+    "armature": lambda s: (0.1 * s.inertia, 5 * s.inertia),
+    "stiffness": lambda s: (0.1 * s.torque_rms / s.span, 10 * s.torque_rms / s.span),
+    "force_limit": lambda s: (0.1 * s.torque_peak, 2 * s.torque_peak),
+    "constant_force": lambda s: (0.1 * s.torque_rms, s.torque_peak),
+}
+"""Field -> (size that matters, largest sensible value) at a joint."""

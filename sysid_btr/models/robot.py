@@ -1,0 +1,141 @@
+"""Robots: where a model comes from, and what is known about it beyond its MJCF."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sysid_btr.errors import ModelError
+from sysid_btr.models.modifier import Modifier
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from sysid_btr.io.log import Log
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A model that can be compiled, and its table of what identification needs to know.
+
+    Attributes
+    ----------
+    name : how the user calls it.
+    make_spec : builds a fresh, editable MjSpec.
+    path : the file it came from, if any.
+    digest : SHA-256 of the compiled-from XML.
+    bounds : parameter or ``FIELD`` -> (lower, upper), over the defaults of the grammar.
+    tied : groups of joints driven by one motor; their gains are one parameter.
+    always : modifiers without parameters of their own that belong to the robot (drive electronics).
+    """
+
+    name: str
+    make_spec: Callable[[], mujoco.MjSpec]
+    path: Path | None = None
+    digest: str = ""
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    tied: tuple[tuple[str, ...], ...] = ()
+    always: tuple[Modifier, ...] = ()
+    configure: Callable[[Robot, Log], Robot] | None = None
+
+    def for_log(self, log: Log) -> Robot:
+        """The robot as this log's metadata describes it (servo registers, supply, load)."""
+        return self if self.configure is None else self.configure(self, log)
+
+    def compile(self) -> mujoco.MjModel:
+        """The plain model."""
+        try:
+            return self.make_spec().compile()
+        except ValueError as error:
+            raise ModelError(f"model {self.name}: MuJoCo cannot compile it: {error}") from error
+
+
+def load_robot(name: str) -> Robot:
+    """A built-in robot by name, or any MJCF or URDF by path.
+
+    Raises
+    ------
+    ModelError
+        Unknown name, missing file, or a file that MuJoCo cannot read.
+    """
+    from sysid_btr.models.builtin import BUILTIN
+
+    if name in BUILTIN:
+        return BUILTIN[name]()
+    path = Path(name)
+    if not path.is_file():
+        listing = ", ".join(sorted(BUILTIN))
+        raise ModelError(
+            f"model {name!r}: neither a built-in model ({listing}) nor an existing file. "
+            "Give one of these names, or the path of an MJCF or URDF file."
+        )
+    return robot_from_file(path)
+
+
+def robot_from_file(path: Path) -> Robot:
+    """Any MJCF or URDF as a robot."""
+    import mujoco
+
+    def make_spec() -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_file(str(path))
+
+    try:
+        make_spec().compile()
+    except (ValueError, OSError) as error:
+        raise ModelError(f"model {path}: MuJoCo cannot read it: {error}") from error
+    return Robot(name=path.stem, make_spec=make_spec, path=path, digest=_digest(path.read_bytes()))
+
+
+def robot_from_spec(name: str, make_spec: Callable[[], mujoco.MjSpec], **known: object) -> Robot:
+    """A robot defined in Python."""
+    xml = make_spec().to_xml()
+    return Robot(name=name, make_spec=make_spec, digest=_digest(xml.encode()), **known)  # type: ignore[arg-type]
+
+
+def joint_names(robot: Robot) -> tuple[str, ...]:
+    """Hinge and slide joints of the model, in model order."""
+    model = robot.compile()
+    return tuple(model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in (2, 3))
+
+
+def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
+    """Joint limits where the model states them, rad or m."""
+    model = robot.compile()
+    ranges = {}
+    for i in range(model.njnt):
+        low, high = model.jnt_range[i]
+        if model.jnt_type[i] in (2, 3) and high > low:
+            ranges[model.joint(i).name] = (float(low), float(high))
+    return ranges
+
+
+def body_names(robot: Robot) -> tuple[str, ...]:
+    """Bodies of the model with mass, in model order."""
+    model = robot.compile()
+    return tuple(model.body(i).name for i in range(1, model.nbody) if model.body_mass[i] > 0)
+
+
+def servo_joints(robot: Robot) -> tuple[str, ...]:
+    """Joints that a position servo drives, in model order."""
+    model = robot.compile()
+    return tuple(model.joint(int(model.actuator_trnid[a, 0])).name for a in servo_actuators(model))
+
+
+def servo_actuators(model: mujoco.MjModel) -> Sequence[int]:
+    """Actuators that act on a joint with a fixed gain and an affine bias."""
+    import mujoco
+
+    return [
+        a
+        for a in range(model.nu)
+        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
+        and model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
+    ]
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

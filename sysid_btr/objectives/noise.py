@@ -1,0 +1,80 @@
+"""Noise floor of each sensor from the log itself: what no model can explain.
+
+Two estimates, the larger wins. High-frequency content: the motion of a robot is smooth on the scale of a
+few samples, so high-order differences of a sensor hold its white noise alone; the median absolute value
+keeps impacts and reversals out (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521). Quantisation:
+the smallest step between values, over the square root of 12, for sensors that stand still.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb, sqrt
+from typing import Literal
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+
+ORDERS = (2, 3, 4, 5)
+"""Orders of difference tried; the smallest estimate has the least motion left in it."""
+MAD_TO_STD = 1.4826
+MIN_SAMPLES = 30
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Standard deviation of one sensor's noise, how it was found, and the sensor's step (0 if none)."""
+
+    sigma: float
+    method: Literal["high-frequency", "quantisation", "unknown"]
+    step: float
+
+
+def noise_floor(values: FloatArray) -> NoiseFloor:
+    """Noise of one sensor channel.
+
+    Parameters
+    ----------
+    values : (n,) samples in time order; NaN where missing.
+
+    Returns
+    -------
+    NoiseFloor
+        ``unknown`` with a tiny sigma where there are too few samples.
+    """
+    step = quantisation_step(values)
+    finite = values[np.isfinite(values)]
+    if len(finite) < MIN_SAMPLES:
+        spread = float(np.std(finite)) if len(finite) else 0.0
+        return NoiseFloor(max(step / sqrt(12), 1e-6 * spread, 1e-12), "unknown", step)
+    estimates = []
+    for order in ORDERS:
+        gain = sqrt(comb(2 * order, order))
+        difference = np.diff(values, n=order)
+        difference = difference[np.isfinite(difference)]
+        if len(difference) < MIN_SAMPLES // 2:
+            continue
+        moving = np.abs(difference)
+        robust = MAD_TO_STD * float(np.median(moving)) / gain
+        # a coarse encoder makes most differences zero or one step: the median then says nothing
+        coarse = float(np.sqrt(np.mean(np.minimum(moving, 6 * np.median(moving) + 2 * step) ** 2))) / gain
+        estimates.append(coarse if robust < step / 2 else robust)
+    sigma = min(estimates) if estimates else 0.0
+    if sigma <= step / sqrt(12):
+        return NoiseFloor(max(step / sqrt(12), 1e-12), "quantisation", step)
+    return NoiseFloor(sigma, "high-frequency", step)
+
+
+def quantisation_step(values: FloatArray) -> float:
+    """Smallest step of a quantised sensor, or 0 where its values are continuous."""
+    finite = values[np.isfinite(values)]
+    distinct = np.unique(finite)
+    if len(distinct) < 2:
+        return 0.0
+    # a continuous sensor repeats almost no value
+    if len(distinct) > 0.9 * len(finite):
+        return 0.0
+    gaps = np.diff(distinct)
+    gaps = gaps[gaps > 1e-9 * max(abs(distinct[0]), abs(distinct[-1]), 1e-300)]
+    return float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0

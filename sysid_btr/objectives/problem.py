@@ -1,0 +1,160 @@
+"""Replays and targets as a least-squares problem for the estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.models.modifier import Modifier, Parameter
+from sysid_btr.objectives.targets import Target
+from sysid_btr.replay.engine import Numerics, Replay
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode: its replay and what it is compared with."""
+
+    replay: Replay
+    targets: tuple[Target, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayProblem:
+    """Whitened residuals of episodes under candidates: a `ResidualProblem` of the estimators.
+
+    The whitened residual of a sample is (measured - predicted) / sigma; the loss is half minus twice the
+    Gaussian log-likelihood up to a constant, that is the sum of squares.
+
+    Attributes
+    ----------
+    episodes : replays under the same parameters.
+    start : (p,) where a search begins.
+    """
+
+    episodes: tuple[Episode, ...]
+    start: FloatArray
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.episodes[0].replay.parameters
+
+    @property
+    def modifiers(self) -> tuple[Modifier, ...]:
+        return self.episodes[0].replay.modifiers
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    @cached_property
+    def lower(self) -> FloatArray:
+        return np.array([p.lower for p in self.parameters])
+
+    @cached_property
+    def upper(self) -> FloatArray:
+        return np.array([p.upper for p in self.parameters])
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """(p,) size of a change that matters."""
+        return np.array([p.scale for p in self.parameters])
+
+    @cached_property
+    def count(self) -> int:
+        """Number of samples that count."""
+        return int(sum(target.mask.sum() for e in self.episodes for target in e.targets))
+
+    def residuals(self, candidates: FloatArray) -> FloatArray:
+        """Whitened residuals, (m, r), of candidates (m, p); NaN rows where a candidate diverged."""
+        candidates = np.atleast_2d(candidates)
+        result = np.empty((len(candidates), self.count))
+        column = 0
+        for episode in self.episodes:
+            width = int(sum(t.mask.sum() for t in episode.targets))
+            for rows, outputs in episode.replay.chunks(candidates):
+                place = column
+                for target in episode.targets:
+                    white = (target.measured - target.predicted(outputs)) / target.sigma
+                    size = int(target.mask.sum())
+                    result[rows, place : place + size] = white[:, target.mask]
+                    place += size
+            column += width
+        return result
+
+    def loss(self, candidates: FloatArray) -> FloatArray:
+        """Sum of squared whitened residuals, (m,); NaN where a candidate diverged."""
+        candidates = np.atleast_2d(candidates)
+        total = np.zeros(len(candidates))
+        for episode in self.episodes:
+            for rows, outputs in episode.replay.chunks(candidates):
+                for target in episode.targets:
+                    white = (target.measured - target.predicted(outputs)) / target.sigma
+                    total[rows] += np.sum(white[:, target.mask] ** 2, axis=1)
+        return total
+
+    @cached_property
+    def blocks(self) -> IntArray:
+        """(r,) label of the stretch of time each residual belongs to, for cluster-robust covariances."""
+        labels, offset = [], 0
+        for episode in self.episodes:
+            time = episode.replay.log.time - episode.replay.log.time[0]
+            stretch = (time / BLOCK).astype(np.int64) + offset
+            for target in episode.targets:
+                grid = np.broadcast_to(stretch[: len(target.mask), None], target.mask.shape)
+                labels.append(grid[target.mask])
+            offset = int(stretch.max()) + 1
+        return np.concatenate(labels)
+
+    @cached_property
+    def column_labels(self) -> IntArray:
+        """(r,) index of the log column (episode, channel, joint) each residual belongs to."""
+        labels, offset = [], 0
+        for episode in self.episodes:
+            for target in episode.targets:
+                grid = np.broadcast_to(offset + np.arange(len(target.joints)), target.mask.shape)
+                labels.append(grid[target.mask])
+                offset += len(target.joints)
+        return np.concatenate(labels)
+
+    @property
+    def columns(self) -> tuple[tuple[int, Target, int], ...]:
+        """(episode, target, position in the target) of every log column, as `column_labels` counts them."""
+        return tuple(
+            (i, target, k)
+            for i, episode in enumerate(self.episodes)
+            for target in episode.targets
+            for k in range(len(target.joints))
+        )
+
+    def with_modifiers(self, modifiers: Sequence[Modifier], start: FloatArray) -> ReplayProblem:
+        """The same data under another set of modifiers."""
+        episodes = tuple(
+            replace(e, replay=replace(e.replay, modifiers=tuple(modifiers))) for e in self.episodes
+        )
+        return ReplayProblem(episodes, start)
+
+    def with_numerics(self, numerics: Numerics) -> ReplayProblem:
+        """The same problem under another integrator or step."""
+        episodes = tuple(replace(e, replay=replace(e.replay, numerics=numerics)) for e in self.episodes)
+        return ReplayProblem(episodes, self.start)
+
+    def with_sigma(self, sigma: Sequence[FloatArray]) -> ReplayProblem:
+        """The same problem whitened by other standard deviations, one array a target in order."""
+        values = iter(sigma)
+        episodes = tuple(
+            replace(e, targets=tuple(replace(t, sigma=next(values)) for t in e.targets))
+            for e in self.episodes
+        )
+        return ReplayProblem(episodes, self.start)
+
+    def failed(self, residuals: FloatArray) -> BoolArray:
+        """(m,) rows that diverged."""
+        return ~np.isfinite(residuals).all(axis=1)
+
+
+BLOCK = 0.5
+"""Seconds; residuals closer than this are allowed to be correlated in standard errors."""

@@ -1,0 +1,468 @@
+"""CPU replay engine: one log under many candidates on `mujoco.batch.Batch`.
+
+A `Replay` compiles its model once. Candidates are rows of numbers that modifiers write into expanded
+compiled fields; they run in chunks, and a chunk in segments of steps, so that memory stays bounded
+whatever the number of candidates and the length of the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.errors import ModelError
+from sysid_btr.models.modifier import Index, Modifier, Outputs, Parameter, Rig, Step
+from sysid_btr.models.robot import Robot
+from sysid_btr.replay.grid import Grid, at_samples, make_grid
+from sysid_btr.replay.start import initial_state
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco.batch import Batch
+
+    from sysid_btr.io.log import Log
+
+CHUNK = 32
+"""Candidates simulated together; enough to share the cost of a Python step, few enough for the cache."""
+SEGMENT = 1024
+"""Steps per rollout call; bounds the records that are held at once."""
+LINK_SUFFIX = "__link"
+"""Name ending of the second joint that play or compliance adds on the link side."""
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """How the equations are integrated: MuJoCo's integrator by name, and the step in s."""
+
+    integrator: str
+    timestep: float
+
+    def halved(self) -> Numerics:
+        return Numerics(self.integrator, self.timestep / 2)
+
+    def __str__(self) -> str:
+        return f"{self.integrator} {1e3 * self.timestep:g} ms"
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One episode of a log, a robot and its modifiers, ready to be run under candidates.
+
+    Attributes
+    ----------
+    robot, log, modifiers, numerics : what is replayed and how.
+    effort : whether servo torques are predicted too.
+    threads : worker threads, 0 for all cores.
+    """
+
+    robot: Robot
+    log: Log
+    modifiers: tuple[Modifier, ...]
+    numerics: Numerics
+    effort: bool = False
+    threads: int = 0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Free numbers of a candidate, in the order of its columns."""
+        return tuple(p for modifier in self.modifiers for p in modifier.parameters)
+
+    @property
+    def all_modifiers(self) -> tuple[Modifier, ...]:
+        return (*self.robot.always, *self.modifiers)
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model, with the structure that the modifiers ask for."""
+        return compile_model(self.robot, self.log, self.all_modifiers, self.numerics)
+
+    @cached_property
+    def index(self) -> Index:
+        return make_index(self.model)
+
+    @cached_property
+    def start(self) -> tuple[FloatArray, FloatArray]:
+        """Initial positions and velocities of the joints, (j,) each."""
+        return initial_state(self.log, self.index.joints, self.model.qpos0[self.index.qpos])
+
+    @cached_property
+    def grid(self) -> Grid:
+        return make_grid(self.log, self.index.joints, self.start[0], self.numerics.timestep)
+
+    def predict(self, candidates: FloatArray) -> Outputs:
+        """All predicted sensors at once; for many candidates iterate over `chunks` instead."""
+        parts = [outputs for _, outputs in self.chunks(candidates)]
+        if len(parts) == 1:
+            return parts[0]
+        return Outputs(
+            time=parts[0].time,
+            position=np.concatenate([p.position for p in parts]),
+            velocity=np.concatenate([p.velocity for p in parts]),
+            effort=None
+            if parts[0].effort is None
+            else np.concatenate([p.effort for p in parts if p.effort is not None]),
+        )
+
+    def chunks(self, candidates: FloatArray) -> Iterator[tuple[slice, Outputs]]:
+        """Predicted sensors, a chunk of candidates at a time.
+
+        Parameters
+        ----------
+        candidates : (m, parameters).
+
+        Yields
+        ------
+        (slice, Outputs)
+            Rows of the chunk, and sensors (rows, samples, joints). A diverged candidate is all NaN.
+        """
+        candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
+        if candidates.shape[1] != len(self.parameters):
+            raise ValueError(f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}")
+        for first in range(0, len(candidates), CHUNK):
+            rows = slice(first, min(first + CHUNK, len(candidates)))
+            yield rows, self._run(candidates[rows])
+
+    def _values(self, candidates: FloatArray) -> list[tuple[Modifier, FloatArray]]:
+        pairs, column = [], 0
+        for modifier in self.all_modifiers:
+            count = len(modifier.parameters)
+            pairs.append((modifier, modifier.spread(candidates[:, column : column + count])))
+            column += count
+        return pairs
+
+    def _run(self, candidates: FloatArray) -> Outputs:
+        from mujoco.batch import Batch
+
+        m = len(candidates)
+        pairs = self._values(candidates)
+        batch = Batch(self.model, m, self.threads)
+        rig = Rig(self.model, batch, self.index, self.numerics.timestep)
+        for modifier, values in pairs:
+            modifier.write_fields(rig, values)
+        if rig.touched & set(_setconst_inputs()):
+            batch.set_const()
+        index = self.index
+        qpos = np.tile(self.start[0], (m, 1))
+        qvel = np.tile(self.start[1], (m, 1))
+        command: FloatArray = np.broadcast_to(self.grid.command, (m, *self.grid.command.shape))
+        applied: FloatArray | None = None
+        border_time = np.arange(self.grid.steps + 1) * self.grid.timestep
+        for modifier, values in pairs:
+            modifier.initial_state(rig, values, qpos, qvel)
+            command = modifier.shape_command(rig, values, command)
+            torque = modifier.applied_torque(rig, values, border_time)
+            if torque is not None:
+                applied = torque if applied is None else applied + torque
+        batch.bind("qpos")[:, index.qpos] = qpos
+        batch.bind("qvel")[:, index.dof] = qvel
+        laws = [(mod, val) for mod, val in pairs if type(mod).overrides("law")]
+        if laws:
+            states = self._step_through(rig, laws, command, applied)
+        else:
+            states = self._roll_out(rig, command, applied)
+        position, velocity = at_samples(self.grid, states.position, states.velocity)
+        effort = None
+        if self.effort:
+            motor, motor_velocity = at_samples(self.grid, states.motor, states.motor_velocity)
+            effort = states.effort
+            if effort is None:
+                steps = np.minimum(self.grid.state[self.grid.before], self.grid.steps - 1)
+                effort = servo_torque(rig, command[:, steps], motor, motor_velocity)
+            else:
+                effort = effort[:, self.grid.before]
+        outputs = Outputs(self.grid.sample_time, position, velocity, effort)
+        for modifier, values in pairs:
+            modifier.read_out(rig, values, outputs)
+        bad = ~np.isfinite(outputs.position).all(axis=(1, 2)) | (batch.warning[:, :, 1].sum(axis=1) > 0)
+        for array in (outputs.position, outputs.velocity, outputs.effort):
+            if array is not None:
+                array[bad] = np.nan
+        return outputs
+
+    def _roll_out(self, rig: Rig, command: FloatArray, applied: FloatArray | None) -> _States:
+        import mujoco
+
+        batch, index, keep = rig.batch, self.index, self.grid.state
+        states = _States.empty(rig.size, len(keep), len(index.joints))
+        states.store(batch, index, 0, self.grid)
+        spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
+        nu, nv = self.model.nu, self.model.nv
+        if applied is not None:
+            spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED.value)
+        driven = index.actuator >= 0
+        for first in range(0, self.grid.steps, SEGMENT):
+            last = min(first + SEGMENT, self.grid.steps)
+            control = np.zeros((rig.size, last - first, nu + (0 if applied is None else nv)))
+            control[:, :, index.actuator[driven]] = command[:, first:last, driven]
+            if applied is not None:
+                control[:, :, nu + index.dof] = applied[:, first:last]
+            records = batch.rollout(last - first, control, spec, record=("qpos", "qvel"))
+            wanted = np.flatnonzero((keep > first) & (keep <= last))
+            local = keep[wanted] - first - 1
+            states.put(index, wanted, records["qpos"][:, local], records["qvel"][:, local])
+        return states
+
+    def _step_through(
+        self,
+        rig: Rig,
+        laws: list[tuple[Modifier, FloatArray]],
+        command: FloatArray,
+        applied: FloatArray | None,
+    ) -> _States:
+        """Step by step, for laws that MuJoCo cannot hold; all candidates of the chunk at once."""
+        batch, index, grid = rig.batch, self.index, self.grid
+        h = grid.timestep
+        states = _States.empty(rig.size, len(grid.state), len(index.joints), effort=self.effort)
+        drive = _Drive(rig)
+        memory = [
+            (modifier, values, modifier.start_law(rig, values), law_index(index, modifier))
+            for modifier, values in laws
+        ]
+        inputs = step_inputs(self.log, grid)
+        qpos_view, qvel_view, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+        qfrc = batch.bind("qfrc_applied")
+        previous = qvel_view[:, index.dof].copy()
+        slot = 0
+        for k in range(grid.steps):
+            q, v = qpos_view[:, index.qpos], qvel_view[:, index.dof]
+            if slot < len(grid.state) and grid.state[slot] == k:
+                states.store(batch, index, slot, grid)
+                slot += 1
+            v_mid = 1.5 * v - 0.5 * previous
+            q_mid = q + 0.5 * h * v_mid
+            previous = v.copy()
+            step = drive.begin(k * h + 0.5 * h, h, command[:, k], q_mid, v_mid)
+            step.inputs = {name: values[k] for name, values in inputs.items()}
+            for modifier, values, state, places in memory:
+                modifier.law(step, values, state, places)
+            drive.write(step)
+            if states.effort is not None and slot > 0 and grid.state[slot - 1] == k:
+                states.effort[:, slot - 1] = drive.torque(step, command[:, k], q, v)
+            ctrl[:, drive.actuators] = command[:, k][:, drive.driven]
+            joint_torque = step.joint_torque if applied is None else step.joint_torque + applied[:, k]
+            qfrc[:, index.dof] = joint_torque
+            batch.step()
+        states.store(batch, index, len(grid.state) - 1, grid)
+        if states.effort is not None:
+            states.effort[:, -1] = states.effort[:, -2]
+        return states
+
+
+@dataclass
+class _States:
+    """States kept at step borders, (m, kept, joints)."""
+
+    position: FloatArray
+    velocity: FloatArray
+    motor: FloatArray
+    motor_velocity: FloatArray
+    effort: FloatArray | None = None
+
+    @classmethod
+    def empty(cls, m: int, kept: int, joints: int, *, effort: bool = False) -> _States:
+        def new() -> FloatArray:
+            return np.empty((m, kept, joints))
+
+        return cls(new(), new(), new(), new(), new() if effort else None)
+
+    def put(self, index: Index, slots: IntArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        self.motor[:, slots] = qpos[:, :, index.qpos]
+        self.motor_velocity[:, slots] = qvel[:, :, index.dof]
+        self.position[:, slots] = self.motor[:, slots]
+        self.velocity[:, slots] = self.motor_velocity[:, slots]
+        linked = np.flatnonzero(index.link_qpos >= 0)
+        if len(linked):
+            self.position[:, slots[:, None], linked] += qpos[:, :, index.link_qpos[linked]]
+            self.velocity[:, slots[:, None], linked] += qvel[:, :, index.link_dof[linked]]
+
+    def store(self, batch: Batch, index: Index, slot: int, grid: Grid) -> None:
+        self.put(index, np.array([slot]), batch.bind("qpos")[:, None], batch.bind("qvel")[:, None])
+
+
+class _Drive:
+    """Per-step access to servos, friction and limits for laws; resets what it added at each step."""
+
+    def __init__(self, rig: Rig) -> None:
+        index = rig.index
+        self.rig = rig
+        self.driven = np.flatnonzero(index.actuator >= 0)
+        self.actuators = index.actuator[self.driven]
+        self.gainprm = rig.array("actuator_gainprm")
+        self.biasprm = rig.array("actuator_biasprm")
+        self.frictionloss = rig.array("dof_frictionloss")
+        self.forcerange = rig.array("actuator_forcerange")
+        self.forcelimited = rig.array("actuator_forcelimited")
+        self.gear = rig.array("actuator_gear")[:, self.actuators, 0].copy()
+        self.base_gain = self.gainprm[:, self.actuators].copy()
+        self.base_bias = self.biasprm[:, self.actuators].copy()
+        self.base_friction = self.frictionloss[:, index.dof].copy()
+        limited = self.forcelimited[:, self.actuators].astype(bool)
+        base = self.forcerange[:, self.actuators].copy()
+        self.base_low = np.where(limited, base[..., 0], -np.inf)
+        self.base_high = np.where(limited, base[..., 1], np.inf)
+        shape = (rig.size, len(index.joints))
+        self._shape = shape
+
+    def begin(self, time: float, h: float, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> Step:
+        shape = self._shape
+        low, high = np.full(shape, -np.inf), np.full(shape, np.inf)
+        low[:, self.driven], high[:, self.driven] = self.base_low, self.base_high
+        return Step(
+            time=time,
+            timestep=h,
+            command=command,
+            qpos=qpos,
+            qvel=qvel,
+            torque=np.clip(self._servo(command, qpos, qvel), low, high),
+            gain=np.ones(shape),
+            motor_torque=np.zeros(shape),
+            joint_torque=np.zeros(shape),
+            friction=np.zeros(shape),
+            limit_low=low,
+            limit_high=high,
+            inputs={},
+        )
+
+    def _servo(self, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
+        torque = np.zeros(self._shape)
+        d, g, b = self.driven, self.base_gain, self.base_bias
+        force = (
+            g[..., 0] * command[:, d]
+            + b[..., 0]
+            + b[..., 1] * self.gear * qpos[:, d]
+            + b[..., 2] * self.gear * qvel[:, d]
+        )
+        torque[:, d] = self.gear * force
+        return torque
+
+    def torque(self, step: Step, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
+        """Servo torque at the start of the step, under the step's laws."""
+        total = step.gain * self._servo(command, qpos, qvel) + step.motor_torque
+        return np.clip(total, step.limit_low, step.limit_high)
+
+    def write(self, step: Step) -> None:
+        d = self.driven
+        gain = step.gain[:, d, None]
+        self.gainprm[:, self.actuators] = self.base_gain * gain
+        self.biasprm[:, self.actuators] = self.base_bias * gain
+        self.biasprm[:, self.actuators, 0] += step.motor_torque[:, d] / self.gear
+        self.frictionloss[:, self.rig.index.dof] = np.maximum(self.base_friction + step.friction, 0.0)
+        low, high = step.limit_low[:, d], step.limit_high[:, d]
+        finite = np.isfinite(low) | np.isfinite(high)
+        self.forcelimited[:, self.actuators] = finite
+        self.forcerange[:, self.actuators, 0] = np.where(finite, low, 0.0)
+        self.forcerange[:, self.actuators, 1] = np.where(finite, high, 0.0)
+
+
+def servo_torque(rig: Rig, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
+    """Joint torque of the servos by their own law, (m, samples, joints); zero where there is no servo.
+
+    Computed here because MuJoCo's `actuator_force` lags the state by a substep.
+    """
+    index, model = rig.index, rig.model
+    torque = np.zeros(np.broadcast_shapes(command.shape, qpos.shape))
+    for j, a in enumerate(index.actuator):
+        if a < 0:
+            continue
+
+        def values(name: str, a: int = int(a)) -> Any:
+            expanded = rig.batch.expanded(name)
+            array = getattr(model, name)[None] if expanded is None else expanded
+            return array[:, a]
+
+        gain, bias = values("actuator_gainprm"), values("actuator_biasprm")
+        gear = values("actuator_gear")[:, :1]
+        force = (
+            gain[:, :1] * command[:, :, j]
+            + bias[:, :1]
+            + bias[:, 1:2] * gear * qpos[:, :, j]
+            + bias[:, 2:3] * gear * qvel[:, :, j]
+        )
+        limited = values("actuator_forcelimited").astype(bool)[:, None]
+        limits = values("actuator_forcerange")
+        clipped = np.clip(force, limits[:, :1], np.maximum(limits[:, 1:2], limits[:, :1]))
+        torque[:, :, j] = gear * np.where(limited, clipped, force)
+    return torque
+
+
+def compile_model(
+    robot: Robot, log: Log, modifiers: Sequence[Modifier], numerics: Numerics
+) -> mujoco.MjModel:
+    """Compile the robot for a log: mount, integrator, step, friction numerics, added structure."""
+    import mujoco
+
+    spec = robot.make_spec()
+    spec.option.timestep = numerics.timestep
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{numerics.integrator.upper()}")
+    if log.meta.mount == "fixed":
+        for joint in list(spec.joints):
+            if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+                spec.delete(joint)
+    # friction as stiff as the step allows: the default creeps and blurs reversals
+    constant = max(2 * numerics.timestep, 0.002)
+    for joint in spec.joints:
+        joint.solref_friction = [constant, 1.0]
+        joint.solimp_friction = [0.99, 0.999, 0.001, 0.5, 2.0]
+    for modifier in modifiers:
+        modifier.edit_spec(spec)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ModelError(f"model {robot.name}: MuJoCo cannot compile it: {error}") from error
+
+
+def make_index(model: mujoco.MjModel) -> Index:
+    """Addresses of every hinge and slide joint of the model."""
+    import mujoco
+
+    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    ids = {model.joint(i).name: i for i in range(model.njnt) if int(model.jnt_type[i]) in single}
+    joints = tuple(name for name in ids if not name.endswith(LINK_SUFFIX))
+    actuator_of = {
+        int(model.actuator_trnid[a, 0]): a
+        for a in range(model.nu)
+        if model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    }
+    own = np.array([ids[j] for j in joints], dtype=np.int64)
+    link = np.array([ids.get(j + LINK_SUFFIX, -1) for j in joints], dtype=np.int64)
+    return Index(
+        joints=joints,
+        qpos=model.jnt_qposadr[own].astype(np.int64),
+        dof=model.jnt_dofadr[own].astype(np.int64),
+        actuator=np.array([actuator_of.get(int(i), -1) for i in own], dtype=np.int64),
+        body=model.jnt_bodyid[own].astype(np.int64),
+        link_qpos=np.where(link >= 0, model.jnt_qposadr[link], -1).astype(np.int64),
+        link_dof=np.where(link >= 0, model.jnt_dofadr[link], -1).astype(np.int64),
+    )
+
+
+def law_index(index: Index, modifier: Modifier) -> IntArray:
+    """Positions of a modifier's places among the joints; every joint for the whole robot."""
+    known = set(index.joints)
+    if all(place in known for place in modifier.places):
+        return index.of(modifier.places)
+    return np.arange(len(index.joints))
+
+
+def step_inputs(log: Log, grid: Grid) -> dict[str, FloatArray]:
+    """Measured drive inputs a law may use, held over each step: supply voltage and enabled flags."""
+    inputs: dict[str, FloatArray] = {}
+    borders = np.arange(grid.steps) * grid.timestep
+    rows = np.clip(
+        np.searchsorted(grid.sample_time, borders + 1e-9, side="right") - 1, 0, len(grid.sample_time) - 1
+    )
+    for name, values in log.channels.items():
+        if name.split(".")[0] in ("voltage", "enabled"):
+            inputs[name] = values[rows]
+    return inputs
+
+
+def _setconst_inputs() -> Sequence[str]:
+    import mujoco
+
+    return tuple(mujoco.MjModel._setconst_inputs)

@@ -1,0 +1,119 @@
+"""The simulation grid of one log: steps, mean commands over each step, and where the samples fall."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.models.interpolation import hermite
+
+if TYPE_CHECKING:
+    from sysid_btr.io.log import Log
+
+ALIGNED = 1e-6
+"""A sample this close to a step border, in steps, is taken to lie on it."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Uniform simulation steps and the log's samples on them.
+
+    Attributes
+    ----------
+    timestep : s.
+    command : (steps, joints) mean of the held command over each step.
+    sample_time : (n,) s since the first sample.
+    state : (k,) indices of the step borders whose state is kept, increasing; 0 is the start.
+    before, after : (n,) positions in `state` of the borders around each sample.
+    fraction : (n,) of a step from `before` to the sample.
+    """
+
+    timestep: float
+    command: FloatArray
+    sample_time: FloatArray
+    state: IntArray
+    before: IntArray
+    after: IntArray
+    fraction: FloatArray
+
+    @property
+    def steps(self) -> int:
+        return len(self.command)
+
+
+def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep: float) -> Grid:
+    """Lay simulation steps over one episode of a log.
+
+    Parameters
+    ----------
+    log : one episode.
+    joints : (j,) joints in the order of the outputs.
+    defaults : (j,) command of a joint that the log does not command.
+    timestep : s.
+    """
+    time = log.time - log.time[0]
+    exact = time / timestep
+    rounded = np.round(exact)
+    aligned = np.abs(exact - rounded) < ALIGNED * np.maximum(1.0, rounded)
+    low = np.where(aligned, rounded, np.floor(exact)).astype(np.int64)
+    fraction = np.where(aligned, 0.0, exact - low)
+    high = np.where(fraction > 0, low + 1, low)
+    state = np.unique(np.concatenate([low, high]))
+    steps = max(int(state[-1]), 1)
+    return Grid(
+        timestep=timestep,
+        command=_mean_command(log, joints, defaults, timestep, steps),
+        sample_time=time,
+        state=state,
+        before=np.searchsorted(state, low),
+        after=np.searchsorted(state, high),
+        fraction=fraction,
+    )
+
+
+def at_samples(
+    grid: Grid, position: FloatArray, velocity: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Cubic Hermite read-out at the sample times of states kept at step borders, (m, k, j) each."""
+    if not np.any(grid.fraction):
+        if len(grid.state) == len(grid.before):
+            return position, velocity
+        return position[:, grid.before], velocity[:, grid.before]
+    f = grid.fraction[None, :, None]
+    h = grid.timestep
+    p0, p1 = position[:, grid.before], position[:, grid.after]
+    v0, v1 = velocity[:, grid.before], velocity[:, grid.after]
+    return hermite(f, h, p0, p1, v0, v1), v0 + f * (v1 - v0)
+
+
+def _mean_command(
+    log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep: float, steps: int
+) -> FloatArray:
+    """Mean over each step of the command as the servo sees it; exact for a held command.
+
+    A held step function enters the dynamics through its impulse, which the mean conserves.
+    """
+    from sysid_btr.io.resample import command_at
+
+    result = np.tile(defaults, (steps, 1))
+    named = [j for j in joints if log.has("command", j)]
+    if not named:
+        return result
+    columns = [joints.index(j) for j in named]
+    time = log.time - log.time[0]
+    borders = np.arange(steps + 1) * timestep
+    if log.meta.command_hold == "linear":
+        result[:, columns] = command_at(log, named, log.time[0] + (borders[:-1] + timestep / 2))
+        return result
+    held = command_at(log, named, log.time)
+    span = np.diff(time, append=max(time[-1], borders[-1]) + timestep)
+    integral = np.vstack([np.zeros(len(named)), np.cumsum(held * span[:, None], axis=0)])
+    knots = np.append(time, time[-1] + span[-1])
+    # relative to the first command, so that the cumulative sum keeps its digits
+    for column, values in zip(columns, integral.T, strict=True):
+        area = np.interp(borders, knots, values)
+        result[:, column] = np.diff(area) / timestep
+    return result

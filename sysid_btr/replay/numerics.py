@@ -1,0 +1,77 @@
+"""Choosing the integrator and the step by a convergence check on the log at hand."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.errors import ModelError
+from sysid_btr.models.robot import Robot
+from sysid_btr.objectives.noise import noise_floor
+from sysid_btr.replay.engine import Numerics, Replay
+
+if TYPE_CHECKING:
+    from sysid_btr.io.log import Log
+
+COARSEST = 0.010
+FINEST = 0.00025
+TOLERATED = 0.02
+"""Root-mean-square change under half the step, in noise floors, at which a step is fine enough.
+
+Small against the noise of one sample is not small against what thousands of samples average to, so this
+is followed by a check of the fitted parameters themselves (`identify.check_numerics`).
+"""
+CHECK_SECONDS = 12.0
+
+
+def choose_numerics(robot: Robot, log: Log, threads: int = 0) -> tuple[Numerics, float]:
+    """Integrator and step for a log, and the change in noise floors when the step is halved.
+
+    A log that states its servo's period is replayed by explicit Euler at that period, because there the
+    control law itself is sampled and held. Otherwise fourth-order Runge-Kutta, at the largest step that
+    divides the sample period and passes the check.
+
+    Raises
+    ------
+    ModelError
+        If the plain model diverges at every step.
+    """
+    if log.meta.servo_period:
+        return Numerics("Euler", float(log.meta.servo_period)), float("nan")
+    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
+    sample = float(np.median(np.diff(log.time)))
+    step = _divisor(sample, COARSEST)
+    now = _positions(robot, part, Numerics("RK4", step), threads)
+    while True:
+        half = _positions(robot, part, Numerics("RK4", step / 2), threads)
+        error = _change(part, now, half)
+        if error <= TOLERATED or (step / 2 < FINEST and np.isfinite(error)):
+            return Numerics("RK4", step), error
+        if step / 2 < FINEST:
+            raise ModelError(
+                f"model {robot.name}: the replay of {log.path or 'the log'} diverges even with a step of "
+                f"{1e3 * step:g} ms. Check gains, armature and masses of the model: a servo far too stiff for "
+                "its inertia, or a body without mass, is the usual cause."
+            )
+        step, now = step / 2, half
+
+
+def _divisor(sample: float, most: float) -> float:
+    """Largest step, at most `most`, that divides the sample period."""
+    return sample / max(int(np.ceil(sample / most - 1e-9)), 1)
+
+
+def _positions(robot: Robot, log: Log, numerics: Numerics, threads: int) -> dict[str, FloatArray]:
+    replay = Replay(robot.for_log(log), log, (), numerics, threads=threads)
+    outputs = replay.predict(np.zeros((1, 0)))
+    return {j: outputs.position[0, :, i] for i, j in enumerate(replay.index.joints) if log.has("position", j)}
+
+
+def _change(log: Log, coarse: dict[str, FloatArray], fine: dict[str, FloatArray]) -> float:
+    worst = []
+    for joint, values in fine.items():
+        sigma = noise_floor(log.channels[f"position.{joint}"]).sigma
+        worst.append(np.sqrt(np.mean((values - coarse[joint]) ** 2)) / sigma)
+    return float(np.max(worst)) if worst else 0.0
