@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -95,8 +96,7 @@ class LossOnly:
 def linear_gaussian(
     rng: np.random.Generator, p: int = 4, r: int = 60, noise: float = 0.1
 ) -> tuple[ToyProblem, FloatArray]:
-    """A straight-line world: residuals ``(A x - b) / noise``, and the design ``A / noise``, shape ``(r,
-    p)``."""
+    """Residuals ``D x - b`` with unit noise, and the design ``D``, shape ``(r, p)``, of scale ``1 / noise``."""
     design = rng.standard_normal((r, p)) / noise
     truth = rng.uniform(-1.0, 1.0, p)
     target = design @ truth + rng.standard_normal(r)
@@ -125,8 +125,7 @@ def rosenbrock() -> ToyProblem:
 
 
 def exponential_decay(rng: np.random.Generator, noise: float = 0.0) -> ToyProblem:
-    """Amplitude, rate and offset of ``a exp(-k t) + c``; residuals whitened by `noise` (by 0.01 if it is
-    0)."""
+    """Amplitude, rate and offset of ``a exp(-k t) + c``; residuals whitened by `noise`, or 0.01."""
     t = np.linspace(0.0, 4.0, 80)
     truth = np.array([2.0, 1.3, -0.4])
 
@@ -159,8 +158,7 @@ def rank_deficient() -> ToyProblem:
 
 
 def bound_active() -> ToyProblem:
-    """A linear problem whose unconstrained minimum (2, -1, 0.5) lies outside; the best corner is not its
-    projection."""
+    """A linear problem whose free minimum (2, -1, 0.5) lies outside: the answer is not its projection."""
     design = np.array([[3.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 1.0], [1.0, 0.0, 1.0]])
     target = design @ np.array([2.0, -1.0, 0.5])
     # With x0 = 1 and x1 >= 0 active, x2 alone is free.
@@ -177,8 +175,7 @@ def bound_active() -> ToyProblem:
 
 
 def failing_region(rng: np.random.Generator, fraction: float = 0.0) -> ToyProblem:
-    """The decay, failing wherever the rate is above 5 or, besides, at a `fraction` of all points scattered
-    about."""
+    """The decay, failing where the rate is above 5, and at a `fraction` of all points scattered about."""
     smooth = exponential_decay(rng, noise=0.01)
 
     def function(x: FloatArray) -> FloatArray:
@@ -429,8 +426,7 @@ def check_budget(estimator: Estimator) -> None:
 
 
 def check_reproducible(estimator: Estimator) -> None:
-    """The same seed gives the same bits, global random numbers are neither used nor touched, inputs not
-    written."""
+    """The same seed gives the same bits; neither global random numbers nor the inputs are touched."""
     problem = _decay()
     before = (problem.lower.tobytes(), problem.upper.tobytes(), problem.start.tobytes())
     legacy_state = vars(np.random)["get_state"]  # by name: looked at here, used by nobody
@@ -466,6 +462,7 @@ def check_progress(estimator: Estimator) -> None:
     calls: list[tuple[int, int | None, float]] = []
 
     def progress(*, done: int, total: int | None, best: float, note: str) -> None:
+        del note
         calls.append((done, total, best))
 
     result = run(estimator, _decay(), progress=progress)
@@ -479,8 +476,7 @@ def check_progress(estimator: Estimator) -> None:
 
 
 def check_interruption(estimator: Estimator) -> None:
-    """Ctrl-C returns the best so far, keeps the journal, and a resumed run ends as if nothing had
-    happened."""
+    """Ctrl-C returns the best so far and keeps the journal; resumed, the fit ends as if uninterrupted."""
     reference = Witness(_decay())
     whole = run(estimator, reference)
     for limit in (0, whole.evaluations // 2):
@@ -558,10 +554,8 @@ def _check_one_resume(
 
 def check_refusals(estimator: Estimator) -> None:
     """A problem it cannot take, or one that is malformed, is refused with a `UsageError`."""
-    try:
+    with suppress(UsageError):
         run(estimator, LossOnly(_decay()))
-    except UsageError:
-        pass
     toy = _decay()
     for lower, start in (
         (toy.upper, toy.start),

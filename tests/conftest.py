@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,20 +56,3 @@ def make_good_log(seed: int = 0, n: int = 800, period: float = 0.01) -> Log:
 def good_log() -> Log:
     """A log in which validation finds nothing."""
     return make_good_log()
-
-
-@pytest.fixture
-def with_columns() -> Callable[..., Log]:
-    """A copy of a log with some columns replaced, added, or (None) removed."""
-
-    def change(log: Log, **columns: np.ndarray | None) -> Log:
-        channels = dict(log.channels)
-        for key, values in columns.items():
-            name = key.replace("__", ".", 1)
-            if values is None:
-                channels.pop(name)
-            else:
-                channels[name] = np.asarray(values, dtype=np.float64)
-        return replace(log, channels=channels)
-
-    return change

@@ -565,6 +565,22 @@ def test_left_and_right_swapped(good_log: Log, check, pair: tuple[str, str]) -> 
     assert problem.where == f"{left} and {right}"
 
 
+def test_swapped_joints_that_are_held_still(good_log: Log, check) -> None:
+    rng = np.random.default_rng(5)
+    n = len(good_log)
+    left, right = np.full(n, 0.2), np.full(n, -0.2)
+    log = change(
+        good_log,
+        command__LHipRoll=left,
+        command__RHipRoll=right,
+        position__LHipRoll=right + rng.normal(scale=0.002, size=n),
+        position__RHipRoll=left + rng.normal(scale=0.002, size=n),
+        velocity__LHipRoll=None,
+        velocity__RHipRoll=None,
+    )
+    assert only(check(log), "joint.swapped").where == "LHipRoll and RHipRoll"
+
+
 def test_swaps_in_a_recorded_log(shared_data: Path, check) -> None:
     from sysid_btr.io import read_log
 

@@ -83,8 +83,7 @@ class Progress(Protocol):
     """Called after every batch of evaluations."""
 
     def __call__(self, *, done: int, total: int | None, best: float, note: str) -> None:
-        """Report `done` of `total` candidates (None: no limit), the best loss so far, and what is going
-        on."""
+        """Report `done` of `total` candidates (None: no limit), the best loss, and what is going on."""
         ...
 
 
@@ -95,16 +94,19 @@ def silent(*, done: int, total: int | None, best: float, note: str) -> None:
 class Termination(Enum):
     """Why a fit ended; each value is a sentence that can be shown to the user."""
 
-    CONVERGED = "Converged: no step within the tolerance lowers the loss further."
-    BUDGET_SPENT = "The budget was spent before the fit converged: raise it, or resume from the journal with a larger one."
+    CONVERGED = "Converged: the search finds nothing better within its tolerance."
+    BUDGET_SPENT = (
+        "The budget was spent before the fit converged: raise it, or resume from the journal with a "
+        "larger one."
+    )
     ITERATION_LIMIT = (
         "The iteration limit was reached while the loss was still falling: raise the limit, "
         "or begin from a better start."
     )
     INTERRUPTED = "Interrupted: the best parameters so far are returned, and the journal can be resumed."
     STALLED = (
-        "Stalled: the derivatives promise a lower loss but no step finds one. The loss is rough near this point: "
-        "smooth it (shorter windows, softer contacts) or use an estimator without derivatives."
+        "Stalled: the derivatives promise a lower loss but no step finds one. The loss is rough near this "
+        "point: smooth it (shorter windows, softer contacts) or use an estimator without derivatives."
     )
     GAVE_UP = "The search gave up before it converged: begin from a better start, or use another estimator."
     NO_FINITE_CANDIDATE = (
@@ -187,8 +189,8 @@ def require_residuals(problem: Problem, estimator: str) -> ResidualProblem:
     """The problem as one with residuals, or a `UsageError` that names the alternatives."""
     if not has_residuals(problem):
         raise UsageError(
-            f"estimator {estimator!r} needs an objective with residuals, and this one gives only a loss: choose a "
-            "least-squares objective, or an estimator that needs none ('cmaes', 'nlopt:LN_BOBYQA', 'ga')"
+            f"estimator {estimator!r} needs an objective with residuals, and this one gives only a loss: "
+            "choose a least-squares objective, or an estimator that needs none ('cmaes', 'nlopt:LN_BOBYQA', 'ga')"
         )
     return problem
 

@@ -118,8 +118,7 @@ class CmaEs:
 
 
 def _rankable(losses: FloatArray) -> list[float]:
-    """Finite stand-ins for failed candidates, worse than all others: only ranks matter, but `inf` gives
-    NaN."""
+    """Finite stand-ins for failed candidates, the worst of all: only ranks matter, but `inf` gives NaN."""
     finite = losses[np.isfinite(losses)]
     worst = 1.0 if not len(finite) else float(np.nextafter(2.0 * abs(finite.max()) + finite.max(), np.inf))
     return [float(value) for value in np.where(np.isfinite(losses), losses, worst)]

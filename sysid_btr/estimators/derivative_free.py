@@ -1,5 +1,4 @@
-"""The derivative-free algorithms of NLopt (Johnson, https://nlopt.readthedocs.io), in the unit cube of the
-bounds."""
+"""The derivative-free algorithms of NLopt (Johnson, https://nlopt.readthedocs.io), in the unit cube."""
 
 from __future__ import annotations
 
@@ -159,8 +158,8 @@ class _Objective:
 def _refusal(algorithm: str) -> str:
     if algorithm.upper().startswith("CMA"):
         return (
-            f"NLopt has no CMA-ES, so 'nlopt:{algorithm}' does not exist. Use {_INSTEAD_OF_CMA}, or 'cmaes' and from "
-            "its result 'nlopt:LN_BOBYQA'"
+            f"NLopt has no CMA-ES, so 'nlopt:{algorithm}' does not exist. Use {_INSTEAD_OF_CMA}, "
+            "or 'cmaes' and from its result 'nlopt:LN_BOBYQA'"
         )
     if "D_" in algorithm[:3].upper():
         return (

@@ -132,9 +132,9 @@ class Journal:
         same = record.candidates[:common].tobytes() == candidates[:common].tobytes()
         if record.kind != kind or other_size or not same:
             raise UsageError(
-                f"{self._label}: record {self._cursor + 1} of {len(self._records)} was made for other candidates than "
-                "this fit asks for. The seed, the estimator's settings or a library version differ from the run that "
-                "wrote it: resume with the same ones, or begin anew with another journal (--overwrite)"
+                f"{self._label}: record {self._cursor + 1} of {len(self._records)} was made for other candidates "
+                "than this fit asks for. The seed, the estimator's settings or a library version differ from the "
+                "run that wrote it: resume with the same ones, or begin anew with another journal (--overwrite)"
             )
         self._cursor += 1
         return record
@@ -257,8 +257,8 @@ class Journal:
         if fingerprint != self.fingerprint:
             raise UsageError(
                 f"journal {path} belongs to another fit (its fingerprint is {fingerprint!r}, this fit's is "
-                f"{self.fingerprint!r}): resume with the model, logs, parameters, estimator and seed it was written "
-                "with, or begin anew (--overwrite)"
+                f"{self.fingerprint!r}): resume with the model, logs, parameters, estimator and seed it "
+                "was written with, or begin anew (--overwrite)"
             )
 
     @staticmethod

@@ -60,8 +60,7 @@ class _Stencil:
 
     @classmethod
     def forward(cls, u: FloatArray, steps: FloatArray) -> _Stencil:
-        """One displaced candidate a parameter; `steps` are signed, and flipped where they would leave the
-        box."""
+        """One displaced candidate a parameter; `steps` are signed, flipped where they would leave the box."""
         inside = (u + steps >= 0.0) & (u + steps <= 1.0)
         return cls(u, np.where(inside, steps, -steps)[:, None])
 
@@ -82,8 +81,7 @@ class _Stencil:
         return rows
 
     def columns(self, rows: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Derivatives ``(p, r)`` per unit of the cube, and which parameters had no finite neighbour
-        ``(p,)``."""
+        """Derivatives ``(p, r)`` per unit of the cube, and which parameters had no finite neighbour."""
         p, k = self.offsets.shape
         base = rows[0]
         columns = np.zeros((p, rows.shape[1]))
@@ -355,8 +353,7 @@ def _climb(
     ladder: tuple[FloatArray, ...],
     note: str,
 ) -> tuple[FloatArray, float, float] | None:
-    """The best point of the first batch that lowers the loss, its loss and its damping; None if no batch
-    does."""
+    """The best point of the first batch that lowers the loss, its loss and its damping, or None."""
     for factors in ladder:
         if not len(factors):
             continue
@@ -467,8 +464,7 @@ def _unpack(model: _Linear, box: UnitBox) -> tuple[FloatArray, FloatArray]:
 
 
 def _latin_hypercube(rng: Generator, n: int, p: int) -> FloatArray:
-    """``n`` points in the unit cube, one in each of ``n`` slices of every axis
-    (doi:10.1080/00401706.1979.10489755)."""
+    """``n`` points, one in each of ``n`` slices of every axis (doi:10.1080/00401706.1979.10489755)."""
     slices = np.array([rng.permutation(n) for _ in range(p)], dtype=np.float64).T.reshape(n, p)
     points: FloatArray = (slices + rng.random((n, p))) / max(n, 1)
     return points

@@ -71,15 +71,16 @@ def _swapped(log: Log, tracking: Mapping[str, Tracking]) -> list[tuple[str, str]
         if right is None or right not in tracking:
             continue
         b = tracking[right]
-        if not (moves(a, _threshold(log, left)) and moves(b, _threshold(log, right))):
-            continue
+        still = not (moves(a, _threshold(log, left)) or moves(b, _threshold(log, right)))
         # Walking swings both legs alike, half a period apart: a small lag only, and offsets count.
         lags = range(round(0.1 / a.step) + 1)
         own = min(_misfit(a, a, lag) + _misfit(b, b, lag) for lag in lags)
         across = [_misfit(a, b, lag) + _misfit(b, a, lag) for lag in lags]
         lag = int(np.argmin(across))
         follows = min(a.correlation(lag, b), b.correlation(lag, a))
-        if across[lag] < 0.25 * own and follows > 0.8:
+        # Two joints held still can only be told apart by where they are held.
+        apart = still and own > 2 * (5 * _threshold(log, left)) ** 2 and across[lag] < 0.02 * own
+        if apart or (across[lag] < 0.25 * own and follows > 0.8):
             found.append((left, right))
     return found
 
@@ -103,7 +104,10 @@ def _late(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
         reach = min(_SEARCHED_LAG, duration / 4)
         lag, r = best_lag(pair, -reach, reach)
         seconds = lag * pair.step
-        if r > max(0.9, normal + 0.1) and not 0 <= seconds <= _MAX_LAG:
+        # What overlaps at that lag must show the whole motion: pieces of two ramps always match somewhere.
+        overlap, _ = pair.at_lag(lag)
+        whole = spread(overlap) > 0.9 * spread(pair.command[pair.valid])
+        if whole and r > max(0.9, normal + 0.1) and not 0 <= seconds <= _MAX_LAG:
             lags[joint] = seconds
     for kind, chosen in (
         ("late", {joint: lag for joint, lag in lags.items() if lag > 0}),
@@ -242,6 +246,12 @@ def _stuck(log: Log) -> Iterator[Problem]:
         )
 
 
+def _travel(log: Log, joint: str) -> float:
+    """How far the joint moved while its servo was on."""
+    position = log.channels.get(f"position.{joint}")
+    return 0.0 if position is None else spread(position[driven(log, joint)])
+
+
 def _dead(log: Log) -> Iterator[Problem]:
     silent: list[str] = []
     unmoved: list[str] = []
@@ -251,17 +261,12 @@ def _dead(log: Log) -> Iterator[Problem]:
             continue
         channel, _, name = column.partition(".")
         if channel in ("velocity", "effort", "current", "duty"):
-            position = log.channels.get(f"position.{name}", np.zeros(0))
-            if spread(position) > _threshold(log, name):
+            if _travel(log, name) > _threshold(log, name):
                 silent.append(column)
         elif (channel == "imu" and log.meta.mount == "free") or (channel == "force" and forces_vary):
             silent.append(column)
-        elif channel == "command":
-            position = log.channels.get(f"position.{name}", np.zeros(0))
-            if spread(position[driven(log, name)] if len(position) else position) > 15 * _threshold(
-                log, name
-            ):
-                unmoved.append(name)
+        elif channel == "command" and _travel(log, name) > 15 * _threshold(log, name):
+            unmoved.append(name)
     if silent:
         yield Problem(
             "channel.dead",

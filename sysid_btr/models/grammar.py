@@ -6,7 +6,7 @@ import difflib
 import fnmatch
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sysid_btr.errors import UsageError
@@ -23,14 +23,6 @@ SCOPES: dict[Scope, Callable[[Robot], tuple[str, ...]]] = {
     "joint": joint_names,
     "servo": servo_joints,
 }
-
-
-@dataclass(frozen=True)
-class Declared:
-    """Modifiers of the declared parameters of one expression."""
-
-    expression: str
-    modifiers: tuple[FieldModifier, ...]
 
 
 def parse_parameters(
@@ -55,22 +47,17 @@ def parse_parameters(
     for expression in expressions:
         try:
             for modifier in _parse_one(expression, robot, scales):
-                for parameter in modifier.parameters:
-                    for key in _keys(parameter.name):
-                        if key in taken:
-                            raise UsageError(f"{key} is already freed by {taken[key]!r}")
-                        taken[key] = expression
+                for place in modifier.places:
+                    key = f"{modifier.name}:{place}"
+                    if key in taken:
+                        raise UsageError(f"{key} is already freed by {taken[key]!r}")
+                    taken[key] = expression
                 result.append(modifier)
         except UsageError as error:
             problems.append(f"  --fit {expression}: {error}")
     if problems:
         raise UsageError("parameters that cannot be used:\n" + "\n".join(problems))
     return tuple(result)
-
-
-def _keys(name: str) -> list[str]:
-    field, _, places = name.partition(":")
-    return [f"{field}:{place}" for place in places.split(",")]
 
 
 def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[FieldModifier]:
@@ -95,12 +82,12 @@ def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[Fie
             )
         names += [n for n in matched if n not in names]
     if option == "shared":
-        return [_build(cls, tuple(names), robot, scales)]
+        return [_build(cls, tuple(names), robot, scales, label=globs)]
     return [_build(cls, group, robot, scales) for group in _motors(cls.scope, names, robot)]
 
 
 def _scope_noun(scope: Scope) -> str:
-    return {"body": "body with mass", "joint": "joint", "servo": "joint with a servo", "robot": "robot"}[scope]
+    return {"body": "body with mass", "servo": "joint with a servo"}.get(scope, scope)
 
 
 def _motors(scope: Scope, names: list[str], robot: Robot) -> list[tuple[str, ...]]:
@@ -117,14 +104,21 @@ def _motors(scope: Scope, names: list[str], robot: Robot) -> list[tuple[str, ...
 
 
 def _build(
-    cls: type[FieldModifier], places: tuple[str, ...], robot: Robot, scales: Scales | None
+    cls: type[FieldModifier],
+    places: tuple[str, ...],
+    robot: Robot,
+    scales: Scales | None,
+    label: str | None = None,
 ) -> FieldModifier:
     model = robot.compile()
     bare = cls(places=places, shared=len(places) > 1)
-    known = tuple(
-        _limits(parameter, cls.name, places[0], robot, model, scales) for parameter in bare.parameters
-    )
-    return replace(bare, known=known)
+    known = []
+    for parameter in bare.parameters:
+        limits = _limits(parameter, cls.name, places[0], robot, model, scales)
+        if label is not None:
+            limits = replace(limits, name=f"{limits.name.partition(':')[0]}:{label}")
+        known.append(limits)
+    return replace(bare, known=tuple(known))
 
 
 def _limits(

@@ -156,5 +156,49 @@ class ReplayProblem:
         return ~np.isfinite(residuals).all(axis=1)
 
 
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """A problem in some of its parameters, the others held.
+
+    Attributes
+    ----------
+    whole : the problem.
+    free : (p,) which parameters are free.
+    values : (p,) the held values, and where the free ones start.
+    """
+
+    whole: ReplayProblem
+    free: BoolArray
+    values: FloatArray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(n for n, f in zip(self.whole.names, self.free, strict=True) if f)
+
+    @property
+    def lower(self) -> FloatArray:
+        return np.asarray(self.whole.lower[self.free])
+
+    @property
+    def upper(self) -> FloatArray:
+        return np.asarray(self.whole.upper[self.free])
+
+    @property
+    def start(self) -> FloatArray:
+        return np.asarray(self.values[self.free])
+
+    def complete(self, candidates: FloatArray) -> FloatArray:
+        """Candidates (m, free) with the held values, (m, p)."""
+        result = np.tile(self.values, (len(candidates), 1))
+        result[:, self.free] = candidates
+        return result
+
+    def residuals(self, candidates: FloatArray) -> FloatArray:
+        return self.whole.residuals(self.complete(candidates))
+
+    def loss(self, candidates: FloatArray) -> FloatArray:
+        return self.whole.loss(self.complete(candidates))
+
+
 BLOCK = 0.5
 """Seconds; residuals closer than this are allowed to be correlated in standard errors."""

@@ -1,0 +1,107 @@
+"""What closing the loop returns: the verdict, the effects with intervals, and every step of the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.scores import Scores
+from sysid_btr.identify.study import Study
+from sysid_btr.models.modifier import Modifier
+
+Verdict = Literal["explained", "nothing_missing", "ambiguous", "unexplained"]
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An effect that the log shows and the model lacked.
+
+    Attributes
+    ----------
+    effect : name, as in the library.
+    variant : realisation under that name, or empty.
+    where : joint or body names, or ``robot``.
+    parameters : how large, with intervals.
+    gain_holdout : fraction of the held-out chi2 that vanishes with it.
+    confused_with : effects this log cannot tell from it.
+    sentence : the finding in words.
+    """
+
+    effect: str
+    variant: str
+    where: tuple[str, ...]
+    parameters: tuple[Estimate, ...]
+    gain_holdout: float
+    confused_with: tuple[str, ...]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that was weighed, and how much of the residual it would explain.
+
+    Attributes
+    ----------
+    effect, where : what and where.
+    explained : fraction of the excess residual on the held-out part.
+    amplitude : value of its main parameter.
+    confused_with : other candidates whose trace in this log is nearly the same.
+    """
+
+    effect: str
+    where: tuple[str, ...]
+    explained: float
+    amplitude: float
+    confused_with: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """One step: what was added or removed, and the whitened mean square error (chi2) it led to."""
+
+    added: tuple[str, ...]
+    removed: tuple[str, ...]
+    train: float
+    holdout: float
+
+
+@dataclass(frozen=True, eq=False)
+class Closing:
+    """Result of closing the loop.
+
+    Attributes
+    ----------
+    study : as diagnosed; its numerics may have been refined.
+    verdict, message : the finding, and one sentence on it.
+    noise_floor : by channel, SI.
+    nominal, before, after : scores of the plain model, with declared parameters, with effects.
+    parameters : declared parameters in the final model.
+    effects : what was missing.
+    candidates : what was weighed, best first.
+    steps : every step of the way.
+    signature : of the residual that is left, when unexplained.
+    modifiers, values : the final model.
+    replays, seconds : cost.
+    """
+
+    study: Study
+    verdict: Verdict
+    message: str
+    noise_floor: Mapping[str, float]
+    nominal: Scores
+    before: Scores
+    after: Scores
+    parameters: tuple[Estimate, ...]
+    effects: tuple[NamedEffect, ...]
+    candidates: tuple[Candidate, ...]
+    steps: tuple[StepRecord, ...]
+    signature: Mapping[str, Any] | None
+    before_modifiers: tuple[Modifier, ...]
+    before_values: FloatArray
+    modifiers: tuple[Modifier, ...]
+    values: FloatArray
+    replays: int
+    seconds: float
