@@ -96,7 +96,7 @@ class LossOnly:
 def linear_gaussian(
     rng: np.random.Generator, p: int = 4, r: int = 60, noise: float = 0.1
 ) -> tuple[ToyProblem, FloatArray]:
-    """Residuals ``D x - b`` with unit noise, and the design ``D``, shape ``(r, p)``, of scale ``1 / noise``."""
+    """Residuals ``D x - b`` with unit noise, and the design ``D``, shape ``(r, p)``, size ``1 / noise``."""
     design = rng.standard_normal((r, p)) / noise
     truth = rng.uniform(-1.0, 1.0, p)
     target = design @ truth + rng.standard_normal(r)

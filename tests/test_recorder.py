@@ -58,7 +58,11 @@ ODD_ROBOT = """
       </body>
     </body>
   </worldbody>
-  <actuator><position joint="rail" kp="100"/><position joint="swing" kp="10"/><position joint="bend" kp="5"/></actuator>
+  <actuator>
+    <position joint="rail" kp="100"/>
+    <position joint="swing" kp="10"/>
+    <position joint="bend" kp="5"/>
+  </actuator>
 </mujoco>
 """
 
@@ -98,7 +102,7 @@ EXAMPLES = {
 """What makes an effect fit the six-joint leg and show within a second; the others do with their defaults."""
 
 
-# ---- dynamics and numerics ----------------------------------------------------------------------------------
+# ---- dynamics and numerics -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("source", [*ROBOTS, "odd"])
@@ -147,8 +151,8 @@ def test_half_the_step_leaves_every_effect_far_below_the_noise(name: str) -> Non
 def test_stiff_teeth_are_resolved(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = planted(Recording("six_joint_leg", seconds=2.0, seed=3), "backlash:KneePitch")
     usual = exact_channels(spec)[1]["position.KneePitch"]
-    monkeypatch.setattr("benchmarks.recorder.plant.MAX_PHASE", 0.1)
-    np.testing.assert_allclose(exact_channels(spec)[1]["position.KneePitch"], usual, atol=2e-5)
+    monkeypatch.setattr("benchmarks.recorder.plant.MAX_PHASE", 0.08)
+    np.testing.assert_allclose(exact_channels(spec)[1]["position.KneePitch"], usual, atol=5e-5)
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -182,7 +186,7 @@ def test_a_log_of_the_same_robot_is_reproduced(shared_data: Path) -> None:
     assert np.sqrt(np.mean(error**2)) < 6.1e-4
 
 
-# ---- effects at rest: the torques must balance --------------------------------------------------------------
+# ---- effects at rest: the torques must balance ---------------------------------------------------
 
 Balance = Callable[[float, float], float]
 """Sum of torques at command u and recorded position q; zero at rest."""
@@ -238,11 +242,11 @@ def test_voltage_falls_with_time() -> None:
     assert KP * (1.0 - 0.02 * t) * (0.6 - q) == pytest.approx(WEIGHT * np.sin(q), rel=2e-3)
 
 
-# ---- effects in motion --------------------------------------------------------------------------------------
+# ---- effects in motion ---------------------------------------------------------------------------
 
 
 def drag(*effects: str, speed: float = 0.5) -> tuple[float, float]:
-    """Torque that slows a pendulum led along a ramp to u = 1 rad, beyond its own damping, N m; its speed, rad/s."""
+    """Torque (N m) that slows a pendulum led to u = 1 rad, beyond its own damping; and its speed (rad/s)."""
     spec = planted(ramp(speed, seconds=1.0 / speed, sensors=Sensors(velocity=True)), *effects)
     exact = exact_channels(spec)[1]
     q, v = exact["position.pendulum"][-1], exact["velocity.pendulum"][-1]
@@ -252,7 +256,7 @@ def drag(*effects: str, speed: float = 0.5) -> tuple[float, float]:
 
 def test_friction_and_damping_drag_with_their_torque() -> None:
     base = drag()[0]
-    assert base == pytest.approx(0.0, abs=3e-3)  # half a millisecond of command and the pendulum's inertia
+    assert base == pytest.approx(0.0, abs=4e-3)  # half a millisecond of command and the pendulum's inertia
     torque, v = drag("viscous_damping:coefficient=0.4")
     assert torque - base == pytest.approx(0.4 * v, rel=0.01)
     torque, v = drag("quadratic_damping:coefficient=0.8")
@@ -382,7 +386,7 @@ def test_preroll_starts_the_log_in_balance() -> None:
     assert KP * (0.6 - q[0]) == pytest.approx(WEIGHT * np.sin(q[0]), abs=1e-6)
 
 
-# ---- motions, sensors, files --------------------------------------------------------------------------------
+# ---- motions, sensors, files ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

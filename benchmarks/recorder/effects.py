@@ -236,7 +236,7 @@ class Backlash(Effect):
 
     play: float = 0.03
     stiffness: float = 500.0
-    restitution: float = 2.0
+    restitution: float = 5.0
     motor_damping: float = 0.0
     name = "backlash"
 

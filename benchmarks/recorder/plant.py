@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 EDGE = 1e-10  # s; inputs that jump at a step's border are read this far inside the step
-MAX_PHASE = 0.5  # rad; largest (natural frequency x step) of a transmission spring
+MAX_PHASE = 0.25  # rad; largest (natural frequency x step) of a transmission spring
 
 
 class State:
@@ -211,16 +211,13 @@ class Plant:
         self.kp_factor = sample(a.stiffening, np.multiply)
 
     def _input(self, table: Array, k: int, fraction: float) -> Array:
-        row = table[k]
-        if fraction == 0.0:
-            return row[0]
-        if fraction == 0.5:
-            return row[1]
-        if fraction == 1.0:
-            return row[2]
+        start, middle, end = table[k]
+        known: Array | None = {0.0: start, 0.5: middle, 1.0: end}.get(fraction)
+        if known is not None:
+            return known
         if fraction < 0.5:
-            return row[0] + 2.0 * fraction * (row[1] - row[0])
-        return row[1] + (2.0 * fraction - 1.0) * (row[2] - row[1])
+            return np.asarray(start + 2.0 * fraction * (middle - start))
+        return np.asarray(middle + (2.0 * fraction - 1.0) * (end - middle))
 
     def _substeps(self, start: Array, grid: Array) -> int:
         """How many times to split a step so that the stiffest transmission spring is resolved."""
@@ -356,7 +353,7 @@ class Plant:
         k1 += k2
         k1 += k4
         k1 *= h / 6.0
-        return y + k1
+        return np.asarray(y + k1)
 
     def _motor_velocity(self, y: Array) -> Array:
         velocity = y[self.parts[1]].copy()

@@ -113,12 +113,13 @@ def _measure(spec: Recording) -> tuple[Array, dict[str, Array], dict[str, Array]
     nominal = load_robot(spec.robot)
     robot, factors = _true_robot(nominal, spec)
     period = 1.0 / spec.rate
-    time = np.arange(round(spec.seconds * spec.rate)) * period
+    time: Array = np.arange(round(spec.seconds * spec.rate), dtype=np.float64) * period
     commands = _commands(spec, nominal, time, motion_rng)
     effects = tuple(effect.resolved(nominal) for effect in spec.effects)
 
     def held(t: Array) -> Array:
-        return commands[np.clip(np.floor(t / period + 1e-9).astype(int), 0, len(commands) - 1)]
+        now = np.clip(np.floor(t / period + 1e-9).astype(int), 0, len(commands) - 1)
+        return np.asarray(commands[now])
 
     first = -spec.preroll
     last = (

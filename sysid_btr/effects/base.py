@@ -34,6 +34,7 @@ class Effect(Modifier):
     signed : whether its amounts may have either sign.
     structural : whether it adds joints to the model, which then has to be compiled for its places.
     main : kind whose value says how large the effect is.
+    held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
     """
 
     title: ClassVar[str] = ""
@@ -44,6 +45,25 @@ class Effect(Modifier):
     signed: ClassVar[bool] = False
     structural: ClassVar[bool] = False
     main: ClassVar[int] = 0
+    held: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
+        """Values (kinds,) of an effect whose response is that of the probe's directions times `amounts`.
+
+        None where no legal value does that.
+        """
+        values = []
+        for i, kind in enumerate(cls.sized(scale)):
+            if kind.name in cls.held:
+                values.append(probe[0][i])
+            else:
+                changes = (direction[i] - kind.nominal for direction in probe)
+                values.append(
+                    kind.nominal + sum(a * c for a, c in zip(amounts, changes, strict=True))
+                )
+            values[-1] = float(np.clip(values[-1], kind.lower, kind.upper))
+        return np.array(values)
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:

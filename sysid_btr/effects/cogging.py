@@ -19,6 +19,7 @@ class Cogging(Effect):
 
     name: ClassVar[str] = "cogging"
     title: ClassVar[str] = "torque that repeats with the angle"
+    held: ClassVar[tuple[str, ...]] = ("number",)
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("sine", "Nm", 0.0, -5.0, 5.0, 0.05),

@@ -21,6 +21,7 @@ class FootCompliance(Effect):
     title: ClassVar[str] = "change of the ground's softness"
     scope: ClassVar = "robot"
     needs: ClassVar[str] = "a free base on the ground"
+    signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("factor", "1", 1.0, 0.2, 10.0, 0.2),)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("joint_compliance", "motion in the air"),)
 

@@ -21,6 +21,7 @@ class FootFriction(Effect):
     title: ClassVar[str] = "change of the ground's friction"
     scope: ClassVar = "robot"
     needs: ClassVar[str] = "a free base on the ground"
+    signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("factor", "1", 1.0, 0.1, 3.0, 0.1),)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("gravity_tilt", "motion in several directions"),)
 

@@ -16,8 +16,6 @@ from sysid_btr.models.scales import JointScale
 if TYPE_CHECKING:
     import mujoco
 
-STIFFEST = 2e-4
-"""Softness, relative to torque, below which the step cannot resolve the spring."""
 RELAXATION = 0.004
 """Ratio of the spring's damping to its stiffness, s: well damped, as gears are."""
 
@@ -55,16 +53,13 @@ class JointCompliance(Effect):
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         ids = np.array([rig.model.joint(name + LINK).id for name in self.places])
-        own = np.array([rig.model.joint(name).id for name in self.places])
         dofs = rig.model.jnt_dofadr[ids]
-        inertia = rig.model.dof_M0[rig.model.jnt_dofadr[own]]
-        # the stiffest spring that the step resolves: omega h < 0.5
-        rotor = np.maximum(rig.model.dof_armature[rig.model.jnt_dofadr[own]], 1e-3 * inertia)
-        reduced = 1 / (1 / rotor + 1 / np.maximum(inertia - rotor, 1e-3 * inertia))
-        stiffest = 0.25 * reduced / rig.timestep**2
+        mobility = rig.model.dof_invweight0[dofs]
+        # the stiffest spring that the step resolves: (omega h)^2 < 0.5
+        stiffest = 0.5 / (mobility * rig.timestep**2)
         stiffness = 1 / np.maximum(values[:, :, 0], 1 / stiffest)
         rig.array("jnt_stiffness")[:, ids] = stiffness
-        rig.array("dof_damping")[:, dofs] = np.minimum(RELAXATION * stiffness, 0.5 * reduced / rig.timestep)
+        rig.array("dof_damping")[:, dofs] = np.minimum(RELAXATION * stiffness, 0.5 / (mobility * rig.timestep))
 
 
 @dataclass(frozen=True)

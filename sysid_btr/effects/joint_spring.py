@@ -19,6 +19,7 @@ class JointSpring(Effect):
 
     name: ClassVar[str] = "joint_spring"
     title: ClassVar[str] = "spring across the joint"
+    signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("stiffness", "Nm/rad", 0.0, 0.0, 10.0, 0.1),
         Kind("rest", "rad", 0.0, -3.0, 3.0, 0.1),
@@ -40,6 +41,17 @@ class JointSpring(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         k = cls.sized(scale)[0].scale
         return (((k, 0.0), (k, scale.span)),)
+
+    @classmethod
+    def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
+        """The probe's directions are equal springs at several places: amounts add, places average."""
+        total = float(np.sum(amounts))
+        if total <= 0.05 * float(np.sum(np.abs(amounts))):
+            return None
+        kinds = cls.sized(scale)
+        values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
+        values[0] *= total
+        return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         ids = [rig.model.joint(name).id for name in self.places]

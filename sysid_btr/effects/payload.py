@@ -24,6 +24,7 @@ class Payload(Effect):
     name: ClassVar[str] = "payload"
     title: ClassVar[str] = "payload"
     scope: ClassVar = "body"
+    signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("mass", "kg", 0.0, 0.0, 2.0, 0.05),
         *(Kind(axis, "m", 0.0, -0.3, 0.3, 0.02) for axis in "xyz"),
@@ -38,6 +39,17 @@ class Payload(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         m, d = 0.05, 0.05
         return (((m, 0.0, 0.0, 0.0), (m, d, 0.0, 0.0), (m, 0.0, d, 0.0), (m, 0.0, 0.0, d)),)
+
+    @classmethod
+    def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
+        """The probe's directions are equal loads at several places: amounts add, places average."""
+        total = float(np.sum(amounts))
+        if total <= 0.05 * float(np.sum(np.abs(amounts))):
+            return None
+        kinds = cls.sized(scale)
+        values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
+        values[0] *= total
+        return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         mass, inertia = rig.array("body_mass"), rig.array("body_inertia")

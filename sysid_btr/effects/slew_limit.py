@@ -21,6 +21,7 @@ class SlewLimit(Effect):
     title: ClassVar[str] = "limit of the commanded rate"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("rate", "rad/s", 1000.0, 0.05, 1000.0, 0.2),)
+    held: ClassVar[tuple[str, ...]] = ("rate",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("torque_limit", "slow motion under a large load"),
         ("speed_torque_limit", "slow motion under a large load"),

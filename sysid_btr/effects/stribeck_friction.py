@@ -29,6 +29,7 @@ class StribeckFriction(Effect):
         Kind("velocity", "rad/s", 0.1, 0.01, 3.0, 0.05),
     )
     main: ClassVar[int] = 1
+    held: ClassVar[tuple[str, ...]] = ("velocity",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("coulomb_friction", "slow motion below the Stribeck velocity"),
     )

@@ -24,6 +24,7 @@ class ThermalDerating(Effect):
         Kind("alpha", "1/Nm2", 0.0, 0.0, 10.0, 0.1),
         Kind("tau", "s", 10.0, 1.0, 200.0, 5.0),
     )
+    held: ClassVar[tuple[str, ...]] = ("tau",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("voltage_sag", "a rest in the middle of the log, or a logged temperature"),
     )

@@ -22,6 +22,7 @@ class TorqueLimit(Effect):
     title: ClassVar[str] = "limit of the torque"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("limit", "Nm", 100.0, 0.01, 100.0, 0.1),)
+    held: ClassVar[tuple[str, ...]] = ("limit",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("speed_torque_limit", "the limit reached at several speeds"),
         ("slew_limit", "slow motion under a large load"),

@@ -190,7 +190,8 @@ def require_residuals(problem: Problem, estimator: str) -> ResidualProblem:
     if not has_residuals(problem):
         raise UsageError(
             f"estimator {estimator!r} needs an objective with residuals, and this one gives only a loss: "
-            "choose a least-squares objective, or an estimator that needs none ('cmaes', 'nlopt:LN_BOBYQA', 'ga')"
+            "choose a least-squares objective, or an estimator that needs none "
+            "('cmaes', 'nlopt:LN_BOBYQA', 'ga')"
         )
     return problem
 

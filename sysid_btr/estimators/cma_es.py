@@ -13,6 +13,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, Termination
 from sysid_btr.estimators.evaluator import Evaluator, Outcome, drive
 from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.starting import finite_start
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -83,8 +84,8 @@ class CmaEs:
 
     def _search(self, evaluator: Evaluator, rng: Generator) -> Outcome:
         p = len(evaluator.start)
-        evaluator.loss(evaluator.start[None], "start")
-        mean = evaluator.box.enter(evaluator.start)
+        found = finite_start(evaluator, rng)
+        mean = evaluator.box.enter(evaluator.start) if found is None else found[0]
         population = self.population or 4 + int(3 * np.log(max(p, 2)))
         termination = Termination.CONVERGED
         for restart in range(self.restarts + 1):

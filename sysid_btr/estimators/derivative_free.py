@@ -13,6 +13,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, Termination
 from sysid_btr.estimators.evaluator import Evaluator, Outcome, drive
 from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.starting import finite_start
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -39,7 +40,7 @@ class NLopt:
     initial_step
         First step of a local search, fraction of the range.
     max_evaluations
-        Where the budget sets no limit of evaluations: this, or ``500 (p + 1)`` if None.
+        Evaluations at most. None leaves it to the budget, or is ``500 (p + 1)`` where that sets no number.
 
     Raises
     ------
@@ -86,13 +87,17 @@ class NLopt:
         nlopt = import_module("nlopt")
         p = len(evaluator.start)
         nlopt.srand(int(rng.integers(1, 2**31)))
-        objective = _Objective(evaluator)
+        found = finite_start(evaluator, rng)
+        if found is None:
+            return Outcome(Termination.NO_FINITE_CANDIDATE)
+        u, loss = found
+        objective = _Objective(evaluator, loss)
         optimiser = self._optimiser(nlopt, self.algorithm, p)
-        limit = self.max_evaluations or 500 * (p + 1)
-        optimiser.set_maxeval(0 if evaluator.budget.evaluations else limit)
+        limit = self.max_evaluations or (0 if evaluator.budget.evaluations else 500 * (p + 1))
+        optimiser.set_maxeval(limit)  # 0: none
         objective.attach(optimiser)
         try:
-            optimiser.optimize(evaluator.box.enter(evaluator.start))
+            optimiser.optimize(u)
             code = optimiser.last_optimize_result()
         except (nlopt.RoundoffLimited, nlopt.roundoff_limited):
             code = nlopt.XTOL_REACHED  # the search is as fine as floats are: as good as it gets
@@ -121,11 +126,11 @@ class NLopt:
 class _Objective:
     """The loss as NLopt calls it: one candidate, always finite, and an exception kept until NLopt is left."""
 
-    def __init__(self, evaluator: Evaluator) -> None:
+    def __init__(self, evaluator: Evaluator, start_loss: float) -> None:
         self._evaluator = evaluator
         self._optimiser: Any = None
         self.raised: BaseException | None = None
-        self._worst = float(np.nan_to_num(evaluator.loss(evaluator.start[None], "start")[0], posinf=0.0))
+        self._worst = start_loss
 
     def attach(self, optimiser: Any) -> None:
         """Become the objective of `optimiser`."""
@@ -133,13 +138,11 @@ class _Objective:
         optimiser.set_min_objective(self)
 
     def __call__(self, u: FloatArray, _gradient: FloatArray) -> float:
-        try:
-            if not np.all(np.isfinite(u)):
-                raise ArithmeticError("the algorithm asked for a candidate that is not a number")
-            loss = float(self._evaluator.loss(self._evaluator.box.leave(np.clip(u, 0.0, 1.0))[None])[0])
-        except ArithmeticError:
+        if not np.all(np.isfinite(u)):  # the algorithm lost its way
             self._optimiser.force_stop()
             return self._penalty
+        try:
+            loss = float(self._evaluator.loss(self._evaluator.box.leave(u)[None])[0])
         except BaseException as error:
             self.raised = error
             self._optimiser.force_stop()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -132,9 +133,10 @@ class Journal:
         same = record.candidates[:common].tobytes() == candidates[:common].tobytes()
         if record.kind != kind or other_size or not same:
             raise UsageError(
-                f"{self._label}: record {self._cursor + 1} of {len(self._records)} was made for other candidates "
-                "than this fit asks for. The seed, the estimator's settings or a library version differ from the "
-                "run that wrote it: resume with the same ones, or begin anew with another journal (--overwrite)"
+                f"{self._label}: record {self._cursor + 1} of {len(self._records)} was made for other "
+                "candidates than this fit asks for. The seed, the estimator's settings or a library version "
+                "differ from the run that wrote it: resume with the same ones, or begin anew with another "
+                "journal (--overwrite)"
             )
         self._cursor += 1
         return record
@@ -204,8 +206,9 @@ class Journal:
         if self.path is None:
             return
         keep = self._attachment_path(self.path, number)
-        for old in self.path.parent.glob(f"{self.path.name}.*.npy"):
-            if old != keep:
+        own = re.compile(re.escape(self.path.name) + r"\.\d+\.npy")
+        for old in self.path.parent.iterdir():
+            if own.fullmatch(old.name) and old != keep:
                 old.unlink(missing_ok=True)
 
     def _write(self, line: bytes, *, sync: bool) -> None:

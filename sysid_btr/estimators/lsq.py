@@ -33,6 +33,7 @@ from sysid_btr.estimators.base import (
 )
 from sysid_btr.estimators.evaluator import Evaluator, Outcome, drive
 from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.starting import finite_near, latin_hypercube
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -48,36 +49,70 @@ _FIRST_DAMPING = 0.1
 
 
 @dataclass(frozen=True, eq=False)
+class Pattern:
+    """Which parameters can be varied in one candidate, because they move different residuals.
+
+    Curtis, Powell, Reid 1974, doi:10.1093/imamat/13.1.117. A problem offers it by `groups`, a partition of its
+    parameters, and `support(j)`, the residuals ``(r,)`` that parameter j can move (None for all).
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    support: Callable[[int], BoolArray | None]
+
+    @classmethod
+    def of(cls, problem: Problem) -> Pattern:
+        """The problem's own pattern, or one candidate a parameter."""
+        groups = getattr(problem, "groups", None)
+        if groups is None:
+            return cls(tuple((j,) for j in range(len(problem.lower))), lambda j: None)
+        return cls(groups, problem.support)  # type: ignore[attr-defined]
+
+    def group_of(self, parameter: int) -> int:
+        """Index of the group a parameter belongs to."""
+        return next(g for g, group in enumerate(self.groups) if parameter in group)
+
+    def own(self, change: FloatArray, parameter: int) -> FloatArray:
+        """The part of a change of all residuals that this parameter of its group made."""
+        if len(self.groups[self.group_of(parameter)]) == 1:
+            return change
+        support = self.support(parameter)
+        return change if support is None else np.where(support, change, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
 class _Stencil:
     """Finite differences about one point: which candidates, and how their residuals make a Jacobian.
 
     `offsets` (p, k) are displacements in the unit cube, k = 1 (forward) or 2 (central, or one-sided at a
-    bound).
+    bound). Parameters of one group of `pattern` share a candidate.
     """
 
     base: FloatArray
     offsets: FloatArray
+    pattern: Pattern
 
     @classmethod
-    def forward(cls, u: FloatArray, steps: FloatArray) -> _Stencil:
-        """One displaced candidate a parameter; `steps` are signed, flipped where they would leave the box."""
+    def forward(cls, u: FloatArray, steps: FloatArray, pattern: Pattern) -> _Stencil:
+        """One displaced candidate a group; `steps` are signed, flipped where they would leave the box."""
         inside = (u + steps >= 0.0) & (u + steps <= 1.0)
-        return cls(u, np.where(inside, steps, -steps)[:, None])
+        return cls(u, np.where(inside, steps, -steps)[:, None], pattern)
 
     @classmethod
-    def central(cls, u: FloatArray, steps: FloatArray) -> _Stencil:
-        """Two displaced candidates a parameter, error of second order also at a bound."""
+    def central(cls, u: FloatArray, steps: FloatArray, pattern: Pattern) -> _Stencil:
+        """Two displaced candidates a group, error of second order also at a bound."""
         h = np.abs(steps)
         low, high = u - h < 0.0, u + h > 1.0
         first = np.where(low, h, -h)
         second = np.where(low, 2.0 * h, np.where(high, -2.0 * h, h))
-        return cls(u, np.stack([first, second], axis=1))
+        return cls(u, np.stack([first, second], axis=1), pattern)
 
     def candidates(self) -> FloatArray:
-        """The point itself, then the displaced ones, shape ``(1 + p k, p)``, in the unit cube."""
-        p, k = self.offsets.shape
-        rows = np.repeat(self.base[None], 1 + p * k, axis=0)
-        rows[np.arange(1, 1 + p * k), np.repeat(np.arange(p), k)] += self.offsets.ravel()
+        """The point itself, then the displaced ones, shape ``(1 + groups k, p)``, in the unit cube."""
+        k = self.offsets.shape[1]
+        rows = np.repeat(self.base[None], 1 + len(self.pattern.groups) * k, axis=0)
+        for g, group in enumerate(self.pattern.groups):
+            for i in range(k):
+                rows[1 + g * k + i, list(group)] += self.offsets[list(group), i]
         return rows
 
     def columns(self, rows: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -86,11 +121,12 @@ class _Stencil:
         base = rows[0]
         columns = np.zeros((p, rows.shape[1]))
         failed = np.zeros(p, dtype=bool)
-        finite = np.isfinite(rows[1:].sum(axis=1)).reshape(p, k)
+        finite = np.isfinite(rows[1:].sum(axis=1)).reshape(len(self.pattern.groups), k)
         for j in range(p):
-            usable = np.flatnonzero(finite[j])
+            g = self.pattern.group_of(j)
+            usable = np.flatnonzero(finite[g])
             a = self.offsets[j, usable]
-            changes = [rows[1 + j * k + i] - base for i in usable]
+            changes = [self.pattern.own(rows[1 + g * k + i] - base, j) for i in usable]
             if len(usable) == 2:  # the derivative at 0 of the parabola through 0, a0, a1
                 weights = np.array([a[1] / a[0], -a[0] / a[1]]) / (a[1] - a[0])
                 columns[j] = weights[0] * changes[0] + weights[1] * changes[1]
@@ -105,7 +141,7 @@ class _Stencil:
 class _Scheme:
     """How to differentiate, and how far to believe the result."""
 
-    stencil: Callable[[FloatArray, FloatArray], _Stencil]
+    stencil: Callable[[FloatArray, FloatArray, Pattern], _Stencil]
     central: bool
     rank_tolerance: float
 
@@ -123,6 +159,7 @@ class _Linear:
     failed: BoolArray
     faint: BoolArray
     residuals: int
+    neighbour: tuple[FloatArray, float]
     attachment: Callable[[], FloatArray]
 
     def predicted(self, d: FloatArray) -> float:
@@ -203,6 +240,8 @@ class LeastSquares:
         Further points to descend from, in the parameters' units.
     prescreen
         Random candidates simulated for each random start wanted; the best are taken.
+    confirm
+        Whether central differences confirm the minimum; without, a result carries no Jacobian.
 
     Notes
     -----
@@ -210,7 +249,7 @@ class LeastSquares:
     """
 
     tolerance: float = 1e-6
-    step_tolerance: float = 1e-7
+    step_tolerance: float = 1e-8
     forward_step: float = 1e-4
     central_step: float = 3e-4
     damping: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0)
@@ -221,6 +260,7 @@ class LeastSquares:
     n_starts: int = 1
     starts: tuple[tuple[float, ...], ...] = ()
     prescreen: int = 8
+    confirm: bool = True
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or self.n_starts < 1 or self.prescreen < 1:
@@ -267,35 +307,33 @@ class LeastSquares:
         central = _Scheme(_Stencil.central, central=True, rank_tolerance=self.central_rank_tolerance)
         ends = [self._descend(problem, evaluator, u, loss, steps, forward) for u, loss in starts]
         best = min(ends, key=lambda end: end.loss)
+        if not self.confirm:
+            return Outcome(best.termination, box.leave(best.u), best.loss)
         steps = np.minimum(np.abs(best.steps) * self.central_step / self.forward_step, _WIDEST_STEP)
         end = self._descend(problem, evaluator, best.u, best.loss, steps, central)
-        x = box.leave(end.u)
         if end.model is None:
-            return Outcome(end.termination, x, end.loss)
+            return Outcome(end.termination)
+        x = box.leave(end.u)
         residual, jacobian = _unpack(end.model, box)
         return Outcome(end.termination, x, end.loss, jacobian, residual)
 
     def _choose_starts(self, evaluator: Evaluator, rng: Generator) -> list[tuple[FloatArray, float]]:
         box = evaluator.box
+        if any(len(start) != len(box.lower) for start in self.starts):
+            raise UsageError(f"lsq: each start must be {len(box.lower)} numbers, one a parameter")
         given = np.vstack([evaluator.start, *(np.array(start, dtype=np.float64) for start in self.starts)])
         if np.any(given < box.lower) or np.any(given > box.upper):
             raise UsageError("lsq: a start lies outside the parameters' bounds")
         wanted = max(0, self.n_starts - len(given))
-        pool = _latin_hypercube(rng, wanted * self.prescreen, len(box.lower))
+        pool = latin_hypercube(rng, wanted * self.prescreen, len(box.lower))
         u = np.vstack([box.enter(given), pool])
         losses = evaluator.loss(box.leave(u), "choosing starts")
         order = np.argsort(losses[len(given) :], kind="stable")[:wanted] + len(given)
         chosen = [i for i in (*range(len(given)), *order) if np.isfinite(losses[i])]
         if chosen:
             return [(u[i], float(losses[i])) for i in chosen]
-        # Nothing given can be simulated: look in ever smaller neighbourhoods of the start.
-        for reach in (1.0, 0.3, 0.1, 0.03):
-            near = u[0] + reach * (_latin_hypercube(rng, self.prescreen, len(box.lower)) - u[0])
-            losses = evaluator.loss(box.leave(near), "looking for a start that can be simulated")
-            i = int(np.argmin(losses))
-            if np.isfinite(losses[i]):
-                return [(near[i], float(losses[i]))]
-        return []
+        found = finite_near(evaluator, u[0], rng)
+        return [] if found is None else [found]
 
     def _descend(
         self,
@@ -325,6 +363,8 @@ class LeastSquares:
             found = _climb(evaluator, model, u, loss, scheme.rank_tolerance, ladder, note)
             rough = promised <= max(tolerance, _ROUGH_FRACTION / model.residuals) * loss
             halted = Termination.CONVERGED if rough and not model.failed.any() else Termination.STALLED
+            if found is None and model.neighbour[1] < (1.0 - tolerance) * loss:
+                found = (*model.neighbour, _FIRST_DAMPING)  # what the differences stumbled on
             if found is None:
                 return _Point(u, loss, steps, halted, model)
             new_u, new_loss, factor = found
@@ -414,7 +454,7 @@ def _linearise(
     """The model about `u`, and the finite-difference steps for the next one."""
     for _ in range(3):
         model = _simulate_stencil(
-            problem, evaluator, scheme.stencil(u, steps), keep=scheme.central, note=note
+            problem, evaluator, scheme.stencil(u, steps, Pattern.of(problem)), keep=scheme.central, note=note
         )
         # A failed neighbour: look closer, and on the other side.
         closer = np.where(model.failed, -0.25 * steps, steps)
@@ -428,7 +468,8 @@ def _linearise(
 def _simulate_stencil(
     problem: ResidualProblem, evaluator: Evaluator, stencil: _Stencil, *, keep: bool, note: str
 ) -> _Linear:
-    candidates = evaluator.box.leave(stencil.candidates())
+    points = stencil.candidates()
+    candidates = evaluator.box.leave(points)
 
     def reduction(rows: FloatArray) -> tuple[dict[str, FloatArray], FloatArray | None]:
         columns, failed = stencil.columns(rows)
@@ -445,6 +486,7 @@ def _simulate_stencil(
     gram, failed = reduced.arrays["gram"], reduced.arrays["failed"] > 0.0
     change = np.sqrt(np.diag(gram)[:-1]) * np.abs(stencil.offsets).max(axis=1)
     loss = float(reduced.loss[0])
+    nearest = int(np.argmin(reduced.loss))
     return _Linear(
         loss=loss,
         gradient=gram[:-1, -1],
@@ -452,6 +494,7 @@ def _simulate_stencil(
         failed=failed,
         faint=change < _SMALLEST_CHANGE * np.sqrt(loss),
         residuals=int(reduced.arrays["size"][0]),
+        neighbour=(np.clip(points[nearest], 0.0, 1.0), float(reduced.loss[nearest])),
         attachment=reduced.attachment,
     )
 
@@ -461,10 +504,3 @@ def _unpack(model: _Linear, box: UnitBox) -> tuple[FloatArray, FloatArray]:
     stack = model.attachment()
     jacobian: FloatArray = np.ascontiguousarray((stack[:-1] / box.span[:, None]).T)
     return stack[-1].copy(), jacobian
-
-
-def _latin_hypercube(rng: Generator, n: int, p: int) -> FloatArray:
-    """``n`` points, one in each of ``n`` slices of every axis (doi:10.1080/00401706.1979.10489755)."""
-    slices = np.array([rng.permutation(n) for _ in range(p)], dtype=np.float64).T.reshape(n, p)
-    points: FloatArray = (slices + rng.random((n, p))) / max(n, 1)
-    return points

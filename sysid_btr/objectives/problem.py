@@ -12,6 +12,7 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.models.modifier import Modifier, Parameter
 from sysid_btr.objectives.targets import Target
 from sysid_btr.replay.engine import Numerics, Replay
+from sysid_btr.replay.structure import colour, limbs, parameter_limbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +131,25 @@ class ReplayProblem:
             for k in range(len(target.joints))
         )
 
+    @cached_property
+    def _limbs(self) -> tuple[list[frozenset[int]], IntArray]:
+        """Limbs each parameter acts on, and the limb of each residual."""
+        model = self.episodes[0].replay.model
+        where = limbs(model)
+        of_column = np.array([where[target.joints[k]] for _, target, k in self.columns])
+        return parameter_limbs(self.modifiers, where), of_column[self.column_labels]
+
+    @cached_property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Parameters that can be varied in one simulation, because they move different limbs."""
+        return colour(self._limbs[0])
+
+    def support(self, parameter: int) -> BoolArray | None:
+        """(r,) residuals that a parameter can move; None for all."""
+        acts_on, limb = self._limbs
+        own = acts_on[parameter]
+        return np.isin(limb, list(own)) if own else None
+
     def with_modifiers(self, modifiers: Sequence[Modifier], start: FloatArray) -> ReplayProblem:
         """The same data under another set of modifiers."""
         episodes = tuple(
@@ -192,6 +212,17 @@ class Conditional:
         result = np.tile(self.values, (len(candidates), 1))
         result[:, self.free] = candidates
         return result
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """See `ReplayProblem.groups`."""
+        own = {int(i): k for k, i in enumerate(np.flatnonzero(self.free))}
+        found = (tuple(own[i] for i in group if i in own) for group in self.whole.groups)
+        return tuple(group for group in found if group)
+
+    def support(self, parameter: int) -> BoolArray | None:
+        """See `ReplayProblem.support`."""
+        return self.whole.support(int(np.flatnonzero(self.free)[parameter]))
 
     def residuals(self, candidates: FloatArray) -> FloatArray:
         return self.whole.residuals(self.complete(candidates))

@@ -19,6 +19,7 @@ from sysid_btr.errors import ModelError
 from sysid_btr.models.modifier import Index, Modifier, Outputs, Parameter, Rig, Step
 from sysid_btr.models.robot import Robot
 from sysid_btr.replay.grid import Grid, at_samples, make_grid
+from sysid_btr.replay.quiet import quiet
 from sysid_btr.replay.start import initial_state
 
 if TYPE_CHECKING:
@@ -125,7 +126,9 @@ class Replay:
             raise ValueError(f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}")
         for first in range(0, len(candidates), CHUNK):
             rows = slice(first, min(first + CHUNK, len(candidates)))
-            yield rows, self._run(candidates[rows])
+            with quiet():
+                outputs = self._run(candidates[rows])
+            yield rows, outputs
 
     def _values(self, candidates: FloatArray) -> list[tuple[Modifier, FloatArray]]:
         pairs, column = [], 0

@@ -13,8 +13,8 @@ from sysid_btr.models.interpolation import hermite
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
 
-ALIGNED = 1e-6
-"""A sample this close to a step border, in steps, is taken to lie on it."""
+ALIGNED = 1e-2
+"""A sample this close to a step border, in steps, is taken to lie on it: clocks are written in few digits."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep:
     time = log.time - log.time[0]
     exact = time / timestep
     rounded = np.round(exact)
-    aligned = np.abs(exact - rounded) < ALIGNED * np.maximum(1.0, rounded)
+    aligned = np.abs(exact - rounded) < ALIGNED
     low = np.where(aligned, rounded, np.floor(exact)).astype(np.int64)
     fraction = np.where(aligned, 0.0, exact - low)
     high = np.where(fraction > 0, low + 1, low)
@@ -65,7 +65,7 @@ def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep:
     steps = max(int(state[-1]), 1)
     return Grid(
         timestep=timestep,
-        command=_mean_command(log, joints, defaults, timestep, steps),
+        command=_mean_command(log, np.where(aligned, rounded * timestep, time), joints, defaults, timestep, steps),
         sample_time=time,
         state=state,
         before=np.searchsorted(state, low),
@@ -90,7 +90,7 @@ def at_samples(
 
 
 def _mean_command(
-    log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep: float, steps: int
+    log: Log, time: FloatArray, joints: tuple[str, ...], defaults: FloatArray, timestep: float, steps: int
 ) -> FloatArray:
     """Mean over each step of the command as the servo sees it; exact for a held command.
 
@@ -103,7 +103,6 @@ def _mean_command(
     if not named:
         return result
     columns = [joints.index(j) for j in named]
-    time = log.time - log.time[0]
     borders = np.arange(steps + 1) * timestep
     if log.meta.command_hold == "linear":
         result[:, columns] = command_at(log, named, log.time[0] + (borders[:-1] + timestep / 2))

@@ -1,0 +1,63 @@
+"""Make a MuJoCo model move like the robot in a log: which parameters, how sure, and what the model is missing.
+
+>>> import sysid_btr as sb
+>>> study = sb.make_study(sb.load_robot("leg.xml"), [sb.read_log("leg.parquet")])  # doctest: +SKIP
+>>> closing = sb.close(study, ["mass:*", "kp:*=shared"])  # doctest: +SKIP
+
+Names are loaded when they are first used, so that importing the package costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sysid_btr.diagnosis.close import close
+    from sysid_btr.identify.fit import fit
+    from sysid_btr.identify.study import make_study
+    from sysid_btr.io.parquet import read_log, write_log
+    from sysid_btr.io.validation import validate_file, validate_log
+    from sysid_btr.models.robot import load_robot
+    from sysid_btr.replay.log import replay_log
+    from sysid_btr.session import save
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "close": "sysid_btr.diagnosis.close",
+    "fit": "sysid_btr.identify.fit",
+    "load_robot": "sysid_btr.models.robot",
+    "make_study": "sysid_btr.identify.study",
+    "read_log": "sysid_btr.io.parquet",
+    "replay_log": "sysid_btr.replay.log",
+    "save": "sysid_btr.session",
+    "validate_file": "sysid_btr.io.validation",
+    "validate_log": "sysid_btr.io.validation",
+    "write_log": "sysid_btr.io.parquet",
+}
+
+__all__ = [
+    "close",
+    "fit",
+    "load_robot",
+    "make_study",
+    "read_log",
+    "replay_log",
+    "save",
+    "validate_file",
+    "validate_log",
+    "write_log",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'sysid_btr' has no attribute {name!r}; it offers {', '.join(__all__)}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

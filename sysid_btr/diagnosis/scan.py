@@ -1,0 +1,249 @@
+"""Score scan: what every effect at every place would do to the residual, by simulation.
+
+Each effect is simulated at a few working points; its response, projected off what the declared parameters
+can do, is compared with the residual. Limbs that move independently are scanned in one simulation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.effects.base import Effect, Probe, scale_at
+from sysid_btr.models.modifier import Modifier
+from sysid_btr.models.scales import Scales
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.replay.structure import EVERYWHERE, limbs
+
+NO_RESPONSE = 1e-6
+"""Response, relative to the residual, below which a log cannot show an effect."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """One effect at one place at one working point."""
+
+    effect: type[Effect]
+    place: str
+    probe: Probe
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Answer to a question.
+
+    Attributes
+    ----------
+    question : what was asked.
+    rows : (n,) residuals that can respond.
+    response : (n, directions) change of the whitened residual, projected off the declared parameters.
+    amounts : (directions,) legal multiples that explain most of the residual.
+    gain : decrease of the sum of squared residuals.
+    values : (kinds,) the effect they stand for.
+    """
+
+    question: Question
+    rows: IntArray
+    response: FloatArray
+    amounts: FloatArray
+    gain: float
+    values: FloatArray
+
+
+def questions(
+    effects: Sequence[type[Effect]], places: dict[str, tuple[str, ...]], scales: Scales
+) -> list[Question]:
+    """All effects at all places of their scope, at all their working points."""
+    return [
+        Question(effect, place, probe)
+        for effect in effects
+        for place in places[effect.scope]
+        for probe in effect.probes(scale_at(scales, place))
+    ]
+
+
+def scan(
+    problem: ReplayProblem,
+    values: FloatArray,
+    residual: FloatArray,
+    jacobian: FloatArray,
+    asked: Sequence[Question],
+    scales: Scales,
+) -> list[Trace]:
+    """Simulate every question about the residual that a fit has left.
+
+    Parameters
+    ----------
+    problem : data and declared modifiers.
+    values : (p,) fitted.
+    residual, jacobian : (r,) and (r, p) there, whitened.
+    asked : effects, places, working points.
+    scales : sizes at the joints.
+
+    Returns
+    -------
+    list of Trace
+        Those that respond at all, best first.
+    """
+    basis = _orthonormal(jacobian)
+    rest = residual - basis @ (basis.T @ residual)
+    traces: list[Trace] = []
+    for structural in (False, True):
+        chosen = [q for q in asked if q.effect.structural is structural]
+        if structural:
+            for batch in _by_structure(chosen, problem):
+                traces += _ask(problem, values, rest, basis, batch, scales)
+        else:
+            for has_law in (False, True):
+                batch = [q for q in chosen if q.effect.overrides("law") is has_law]
+                if batch:
+                    traces += _ask(problem, values, rest, basis, batch, scales)
+    return sorted(traces, key=lambda t: -t.gain)
+
+
+def _orthonormal(jacobian: FloatArray) -> FloatArray:
+    """Orthonormal basis of what the declared parameters can do."""
+    norm = np.linalg.norm(jacobian, axis=0)
+    live = jacobian[:, norm > 0] / norm[norm > 0]
+    if live.shape[1] == 0:
+        return np.zeros((len(jacobian), 0))
+    u, s, _ = np.linalg.svd(live, full_matrices=False)
+    return np.asarray(u[:, s > 1e-6 * s[0]])
+
+
+def _limb(question: Question, where: dict[str, int]) -> int:
+    return where.get(question.place, EVERYWHERE)
+
+
+def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Question]]:
+    """Structural questions that can share one compiled model: one place a limb."""
+    where = limbs(problem.episodes[0].replay.model)
+    result: list[list[Question]] = []
+    for effect in dict.fromkeys(q.effect for q in asked):
+        own = [q for q in asked if q.effect is effect]
+        waiting = list(dict.fromkeys(q.place for q in own))
+        while waiting:
+            used: set[int] = set()
+            here = []
+            for place in list(waiting):
+                limb = where[place]
+                if limb not in used:
+                    used.add(limb)
+                    here.append(place)
+                    waiting.remove(place)
+            result.append([q for q in own if q.place in here])
+    return result
+
+
+def _ask(
+    problem: ReplayProblem,
+    values: FloatArray,
+    rest: FloatArray,
+    basis: FloatArray,
+    asked: list[Question],
+    scales: Scales,
+) -> list[Trace]:
+    """Simulate questions that share a set of modifiers."""
+    where = limbs(problem.episodes[0].replay.model)
+    extra: list[Modifier] = []
+    offset: dict[tuple[type[Effect], str], int] = {}
+    column = len(values)
+    for effect in dict.fromkeys(q.effect for q in asked):
+        places = tuple(dict.fromkeys(q.place for q in asked if q.effect is effect))
+        modifier = effect.at(places, scales)
+        for i, place in enumerate(places):
+            offset[effect, place] = column + i * len(effect.kinds)
+        column += len(modifier.parameters)
+        extra.append(modifier)
+    wide = problem.with_modifiers((*problem.modifiers, *extra), values)
+    neutral = np.concatenate([values, *(m.neutral for m in extra if isinstance(m, Effect))])
+    # one simulation carries one direction of one question in each limb
+    lanes: dict[int, list[tuple[int, int]]] = {}
+    for i, question in enumerate(asked):
+        for d in range(len(question.probe)):
+            lanes.setdefault(_limb(question, where), []).append((i, d))
+    alone = lanes.pop(EVERYWHERE, [])
+    depth = max((len(lane) for lane in lanes.values()), default=0)
+    jobs = [[lane[k] for lane in lanes.values() if k < len(lane)] for k in range(depth)]
+    jobs += [[item] for item in alone]
+    candidates = np.tile(neutral, (1 + len(jobs), 1))
+    for row, job in enumerate(jobs, start=1):
+        for i, d in job:
+            question = asked[i]
+            at = offset[question.effect, question.place]
+            candidates[row, at : at + len(question.effect.kinds)] = question.probe[d]
+    limb_of_row = wide._limbs[1]
+    responses: dict[tuple[int, int], FloatArray | None] = {}
+    rows_of = {limb: np.flatnonzero(limb_of_row == limb) for limb in lanes}
+    everywhere = np.arange(len(rest))
+    base = wide.residuals(candidates[:1])[0]
+    for first in range(1, len(candidates), 64):
+        block = wide.residuals(candidates[first : first + 64]) - base
+        for change, job in zip(block, jobs[first - 1 : first + 63], strict=False):
+            for i, d in job:
+                rows = rows_of.get(_limb(asked[i], where), everywhere)
+                finite = np.isfinite(change).all()
+                responses[i, d] = change[rows] if finite else None
+    traces = []
+    for i, question in enumerate(asked):
+        rows = rows_of.get(_limb(question, where), everywhere)
+        columns = [responses[i, d] for d in range(len(question.probe))]
+        known = [c for c in columns if c is not None]
+        if len(known) < len(columns):
+            continue
+        trace = _judge(question, rows, np.column_stack(known), rest, basis, scales)
+        if trace is not None:
+            traces.append(trace)
+    return traces
+
+
+def _judge(
+    question: Question,
+    rows: IntArray,
+    response: FloatArray,
+    rest: FloatArray,
+    basis: FloatArray,
+    scales: Scales,
+) -> Trace | None:
+    """How much of the residual legal multiples of a response explain."""
+    projected = response - basis[rows] @ (basis[rows].T @ response)
+    # projecting off shared parameters leaks to other limbs; that part is counted, not stored
+    coefficients = basis[rows].T @ response
+    gram = response.T @ response - coefficients.T @ coefficients
+    inner = projected.T @ rest[rows] - _leak(basis, rows, coefficients, rest)
+    if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= NO_RESPONSE * float(rest @ rest) / len(rest):
+        return None
+    # the residual is measured minus predicted, so a response that explains it has the opposite sign
+    amounts = _legal(question.effect, gram, -inner)
+    gain = float(-2 * amounts @ inner - amounts @ gram @ amounts)
+    values = question.effect.combine(scale_at(scales, question.place), question.probe, amounts)
+    if values is None or gain <= 0:
+        return None
+    return Trace(question, rows, projected, amounts, gain, values)
+
+
+def _leak(basis: FloatArray, rows: IntArray, coefficients: FloatArray, rest: FloatArray) -> FloatArray:
+    """Inner product with the residual of what the projection puts into other rows; rest is off the basis."""
+    outside = -(basis[rows].T @ rest[rows])
+    result: FloatArray = coefficients.T @ outside
+    return result
+
+
+def _legal(effect: type[Effect], gram: FloatArray, target: FloatArray) -> FloatArray:
+    """Minimise a'Ga - 2 a't under the effect's signs; working points of thresholds are not stretched far."""
+    if effect.signed:
+        ridge = 1e-9 * np.trace(gram) * np.eye(len(gram))
+        return np.asarray(np.linalg.solve(gram + ridge, target))
+    from scipy.optimize import nnls
+
+    values, vectors = np.linalg.eigh(gram)
+    root = np.sqrt(np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
+    a = root[:, None] * vectors.T
+    b = (vectors.T @ target) / root
+    amounts = np.asarray(nnls(a, b)[0])
+    if effect.held and len(effect.held) == len(effect.kinds):
+        amounts = np.minimum(amounts, 1.5)
+    return amounts

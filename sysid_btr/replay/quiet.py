@@ -1,0 +1,57 @@
+"""Keep MuJoCo from printing and from writing a log file when a candidate diverges.
+
+A diverging candidate is an ordinary result here (it is reported as NaN), and MuJoCo's default would write
+one warning a candidate to the console and to a file in the working folder.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+
+class _LogConfig(ctypes.Structure):
+    """`mjLogConfig` of MuJoCo 4."""
+
+    _fields_ = (
+        ("logto_console", ctypes.c_bool),
+        ("logto_file", ctypes.c_bool),
+        ("logfile", ctypes.c_char * 1024),
+        ("topics", ctypes.c_int),
+    )
+
+
+@cache
+def _library() -> ctypes.CDLL | None:
+    import mujoco
+
+    found = sorted(Path(mujoco.__file__).parent.glob("*mujoco*.so*")) + sorted(
+        Path(mujoco.__file__).parent.glob("*mujoco*.d*l*")
+    )
+    for path in found:
+        if path.name.startswith(("libmujoco.", "mujoco.")):
+            library = ctypes.CDLL(str(path))
+            if hasattr(library, "mju_getLogConfig"):
+                library.mju_getLogConfig.restype = _LogConfig
+                library.mju_setLogConfig.argtypes = (_LogConfig,)
+                library.mju_setLogConfig.restype = None
+                return library
+    return None
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Run MuJoCo without its console and file messages; the settings are restored after."""
+    library = _library()
+    if library is None:
+        yield
+        return
+    before = library.mju_getLogConfig()
+    library.mju_setLogConfig(_LogConfig(False, False, before.logfile, before.topics))
+    try:
+        yield
+    finally:
+        library.mju_setLogConfig(before)

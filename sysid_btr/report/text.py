@@ -1,0 +1,182 @@
+"""A result as tables for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TextIO
+
+from sysid_btr.result import si
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.table import Table
+
+    from sysid_btr.io.problem import Problem
+
+PLAIN_WIDTH = 118
+"""Columns where the output is no terminal, so that what is piped does not depend on a window."""
+CANDIDATES_SHOWN = 6
+
+
+def console(stream: TextIO) -> Console:
+    """A console that writes results; plain text of fixed width unless `stream` is a terminal."""
+    from rich.console import Console
+
+    width = None if stream.isatty() else PLAIN_WIDTH
+    return Console(file=stream, width=width, highlight=False, emoji=False, markup=False)
+
+
+def show(result: Mapping[str, Any], out: Console) -> None:
+    """Print the result of a fit, a closing or a replay."""
+    for part in _parts(result):
+        out.print(part)
+
+
+def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
+    from rich.text import Text
+
+    verdict = result.get("verdict")
+    headline = f"{verdict.replace('_', ' ')}: {result['message']}" if verdict else result["message"]
+    yield Text(headline, style="bold")
+    yield errors_table(result)
+    for effect in result.get("effects", []):
+        yield Text(f"+ {effect['sentence'] or effect['effect']}")
+        if effect["confused_with"]:
+            yield Text(f"  this log cannot tell it from: {', '.join(effect['confused_with'])}")
+    estimates = [
+        *result.get("parameters", []),
+        *(p for e in result.get("effects", []) for p in e["parameters"]),
+    ]
+    if estimates:
+        yield parameters_table(estimates)
+        for p in estimates:
+            if p["reason"]:
+                yield Text(f"  {p['name']}: {told(p)}: {p['reason']}")
+    if result.get("verdict") in ("ambiguous", "unexplained") and result.get("candidates"):
+        yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
+    if result.get("signature"):
+        yield Text("what is left: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
+    if result.get("converged") is False:
+        yield Text(result["termination"], style="bold")
+    numerics, model = result["numerics"], result["model"]["name"]
+    yield Text(
+        f"model {model}, {numerics['chosen']}; {result['replays']} replays in {result['wall_s']:.1f} s"
+        + (f"; seed {result['seed']}" if result.get("seed") is not None else ""),
+        style="dim",
+    )
+
+
+def stages(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """(key, name) of the models that a result compares."""
+    names = {
+        "replay": [("nominal", "replayed")],
+        "fit": [("nominal", "plain model"), ("before", "fitted")],
+        "close": [("nominal", "plain model"), ("before", "parameters fitted"), ("after", "effects added")],
+    }
+    return names[result["kind"]]
+
+
+def errors_table(result: Mapping[str, Any]) -> Table:
+    """Error of each model on each channel, on fitted and on held-out data, against the noise floor."""
+    table = _table("error (rmse)")
+    columns = stages(result)
+    for _, name in columns:
+        table.add_column(name, justify="right")
+    table.add_column("noise floor", justify="right")
+    for part, label in (("train", "fitted data"), ("holdout", "held out")):
+        for channel in result["nominal"].get(part, {}):
+            unit = result["units"].get(channel, "").partition(",")[0]
+            cells = [error_cell(result[key][part].get(channel), unit) for key, _ in columns]
+            label_here = channel if result["kind"] == "replay" else f"{channel}, {label}"
+            table.add_row(label_here, *cells, si(result["noise_floor"].get(channel), unit))
+    return table
+
+
+def error_cell(score: Mapping[str, Any] | None, unit: str) -> str:
+    """Absolute and relative error of one channel."""
+    if score is None:
+        return ""
+    relative = score["nrmse"]
+    return si(score["rmse"], unit) + ("" if relative is None else f"  ({100 * relative:.3g} %)")
+
+
+def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
+    """Estimates with intervals."""
+    table = _table("parameter")
+    for name in ("nominal", "value", "std", "95 % interval", "unit"):
+        table.add_column(name, justify="left" if name == "unit" else "right", no_wrap=True)
+    table.add_column("told by this log")
+    for p in parameters:
+        known = p["identifiable"] != "no"
+        table.add_row(
+            p["name"],
+            number(p["nominal"]),
+            number(p["value"]) if known else "-",
+            number(p["std"], 2) if known else "-",
+            f"{number(p['ci95'][0])} .. {number(p['ci95'][1])}" if known else "-",
+            "x nominal" if p["unit"] == "1" else p["unit"],
+            told(p),
+        )
+    return table
+
+
+def candidates_table(candidates: Sequence[Mapping[str, Any]]) -> Table:
+    """Effects that were weighed."""
+    table = _table("weighed effect")
+    for name in ("where", "would explain", "size", "hard to tell from"):
+        table.add_column(name)
+    for c in candidates:
+        explained = "-" if c["explained"] is None else f"{100 * c['explained']:.0f} %"
+        where = ", ".join(c["where"])
+        table.add_row(c["effect"], where, explained, number(c["amplitude"]), ", ".join(c["confused_with"]))
+    return table
+
+
+def problems_table(problems: Sequence[Problem]) -> Table:
+    """What is wrong with a log."""
+    table = _table("")
+    for name in ("where", "what is wrong", "what to do"):
+        table.add_column(name)
+    for p in problems:
+        table.add_row(p.severity, p.where, f"{p.message} [{p.code}]", p.remedy)
+    return table
+
+
+def joints_table(joints: Mapping[str, float], unit: str) -> Table:
+    """Error of each joint, worst first."""
+    table = _table("joint")
+    table.add_column("position error (rmse)", justify="right")
+    for name, value in sorted(joints.items(), key=lambda item: -(item[1] or float("inf"))):
+        table.add_row(name, si(value, unit))
+    return table
+
+
+def told(parameter: Mapping[str, Any]) -> str:
+    """Whether a log tells a parameter, in words."""
+    words = {"yes": "yes", "weak": "weakly", "no": "not identifiable"}[parameter["identifiable"]]
+    return f"{words}, at its bound" if parameter["at_bound"] and parameter["identifiable"] != "no" else words
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number in a table."""
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def compact(value: Any) -> str:
+    """A value of a signature in a line of text."""
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, Mapping):
+        return "(" + ", ".join(f"{k} {compact(v)}" for k, v in value.items()) + ")"
+    if isinstance(value, list | tuple):
+        return ", ".join(compact(v) for v in value)
+    return str(value)
+
+
+def _table(first: str) -> Table:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold")
+    table.add_column(first, overflow="fold")
+    return table

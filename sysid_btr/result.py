@@ -1,0 +1,302 @@
+"""result.json: what a run found, with all that is needed to judge and to repeat it.
+
+Strict JSON: a number that is not finite (an unknown noise floor, an infinite bound) is null.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from sysid_btr.errors import UsageError
+
+if TYPE_CHECKING:
+    from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord
+    from sysid_btr.identify.fit import Fit
+    from sysid_btr.identify.intervals import Estimate
+    from sysid_btr.identify.scores import ChannelScore, Scores
+    from sysid_btr.identify.study import Study
+    from sysid_btr.models.robot import Robot
+
+SCHEMA = "sysid_btr.result/1"
+CHANNEL_UNITS = {
+    "position": ("rad", "m"),
+    "velocity": ("rad/s", "m/s"),
+    "effort": ("Nm", "N"),
+}
+"""Unit of a channel for hinges and for slides."""
+
+
+def make_result(outcome: Fit | Closing, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
+    """The content of result.json.
+
+    Parameters
+    ----------
+    outcome : what `fit` or `close` returned.
+    seed : of the generator the estimator was given.
+    wall_s : wall time to record, s; default that of the outcome.
+
+    Returns
+    -------
+    dict
+        Ready for `json.dumps(..., allow_nan=False)`. In a fit, where no effect is added, ``after`` equals
+        ``before``.
+    """
+    from sysid_btr.identify.fit import Fit
+
+    found = _of_fit(outcome) if isinstance(outcome, Fit) else _of_closing(outcome)
+    study = outcome.study
+    plain: dict[str, Any] = clean(
+        {
+            "schema": SCHEMA,
+            **found,
+            "units": channel_units(study),
+            "numerics": {
+                "integrator": study.numerics.integrator,
+                "timestep": study.numerics.timestep,
+                "error_in_noise_floors": study.numerics_error,
+                "chosen": str(study.numerics),
+            },
+            "channels": study.channels,
+            "seed": seed,
+            "versions": versions(),
+            "replays": outcome.replays,
+            "wall_s": outcome.seconds if wall_s is None else wall_s,
+            "logs": _logs(study),
+            "model": model_entry(study.robot),
+        }
+    )
+    return plain
+
+
+def _of_fit(fit: Fit) -> dict[str, Any]:
+    before = scores_entry(fit.before)
+    return {
+        "kind": "fit",
+        "message": fit_message(fit),
+        "converged": fit.result.converged,
+        "termination": fit.result.termination.value,
+        "noise_floor": _floors(fit.before),
+        "nominal": scores_entry(fit.nominal),
+        "before": before,
+        "after": before,
+        "parameters": [
+            {**estimate_entry(e), "numerics_shift": float(shift)}
+            for e, shift in zip(fit.estimates, fit.numerics_shift, strict=True)
+        ],
+        "effects": [],
+        "candidates": [],
+        "steps": [],
+        "signature": None,
+    }
+
+
+def _of_closing(closing: Closing) -> dict[str, Any]:
+    return {
+        "kind": "close",
+        "verdict": closing.verdict,
+        "message": closing.message,
+        "noise_floor": dict(closing.noise_floor),
+        "nominal": scores_entry(closing.nominal),
+        "before": scores_entry(closing.before),
+        "after": scores_entry(closing.after),
+        "parameters": [estimate_entry(e) for e in closing.parameters],
+        "effects": [_effect(e) for e in closing.effects],
+        "candidates": [_candidate(c) for c in closing.candidates],
+        "steps": [_step(s) for s in closing.steps],
+        "signature": closing.signature,
+    }
+
+
+def estimate_entry(estimate: Estimate) -> dict[str, Any]:
+    """One parameter of a result."""
+    return asdict(estimate)
+
+
+def _effect(effect: NamedEffect) -> dict[str, Any]:
+    return {**asdict(effect), "parameters": [estimate_entry(e) for e in effect.parameters]}
+
+
+def _candidate(candidate: Candidate) -> dict[str, Any]:
+    return asdict(candidate)
+
+
+def _step(step: StepRecord) -> dict[str, Any]:
+    return asdict(step)
+
+
+def scores_entry(scores: Scores) -> dict[str, Any]:
+    """Scores by part and channel."""
+    return {"train": channel_entries(scores.train), "holdout": channel_entries(scores.holdout)}
+
+
+def channel_entries(part: Mapping[str, ChannelScore]) -> dict[str, dict[str, Any]]:
+    """Scores by channel: rmse, nrmse, chi2, and the rmse of each joint."""
+    return {
+        channel: {"rmse": s.rmse, "nrmse": s.nrmse, "chi2": s.chi2, "joints": dict(s.joints)}
+        for channel, s in part.items()
+    }
+
+
+def _floors(scores: Scores) -> dict[str, float]:
+    return {channel: s.floor for channel, s in (scores.holdout or scores.train).items()}
+
+
+def fit_message(fit: Fit) -> str:
+    """The outcome of a fit in one sentence."""
+    unit = channel_units(fit.study).get("position", "rad")
+    told = sum(e.identifiable != "no" for e in fit.estimates)
+    parts = [f"{told} of {len(fit.estimates)} parameters can be told from this log"]
+    if "position" in fit.before.holdout:
+        nominal, before = fit.nominal.holdout["position"], fit.before.holdout["position"]
+        parts.append(
+            f"the held-out position error goes from {si(nominal.rmse, unit)} to {si(before.rmse, unit)}, "
+            f"where the sensor's own noise is {si(before.floor, unit)}"
+        )
+    if not fit.result.converged:
+        parts.append("the fit did not converge")
+    return "; ".join(parts) + "."
+
+
+def channel_units(study: Study) -> dict[str, str]:
+    """Unit of each channel on this robot; both where it has hinges and slides."""
+    from sysid_btr.models.robot import joint_names
+
+    model = study.robot.compile()
+    slides = {int(model.joint(j).type[0]) == 2 for j in joint_names(study.robot)}
+    kinds = [k for k, there in ((0, False in slides), (1, True in slides)) if there]
+    return {channel: ", ".join(units[k] for k in kinds) for channel, units in CHANNEL_UNITS.items()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    import mujoco
+    import scipy
+
+    from sysid_btr import __version__
+
+    return {
+        "sysid_btr": __version__,
+        "python": platform.python_version(),
+        "mujoco": str(mujoco.__version__),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+    }
+
+
+def _logs(study: Study) -> list[dict[str, Any]]:
+    from sysid_btr.io.parquet import sha256
+
+    fitted = {log.path for log in study.train}
+    held = {log.path for log in study.holdout}
+    entries = []
+    for path in dict.fromkeys(log.path for log in (*study.train, *study.holdout)):
+        parts = [name for name, paths in (("train", fitted), ("holdout", held)) if path in paths]
+        entries.append(
+            {
+                "path": None if path is None else str(path),
+                "sha256": None if path is None else sha256(path),
+                "used_for": parts,
+            }
+        )
+    return entries
+
+
+def model_entry(robot: Robot) -> dict[str, Any]:
+    """Name, file and digest of a model."""
+    return {
+        "name": robot.name,
+        "path": None if robot.path is None else str(robot.path),
+        "sha256": robot.digest,
+    }
+
+
+def clean(value: Any) -> Any:
+    """Plain JSON types; numbers that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {str(k): clean(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return clean(value.tolist())
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [clean(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    if value is None or isinstance(value, str):
+        return value
+    return str(value)
+
+
+def to_json(result: Mapping[str, Any]) -> str:
+    """Text of result.json; strict JSON that reads back to the same numbers."""
+    return json.dumps(clean(result), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read result.json, or the one in a folder.
+
+    Raises
+    ------
+    UsageError
+        If there is none, or it is not a result of this schema.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / "result.json"
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {file}: {error.strerror}; give the --out folder of a finished run"
+        ) from error
+    except ValueError as error:
+        raise UsageError(f"{file} is not JSON ({error}); give the result.json of a finished run") from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if schema != SCHEMA:
+        raise UsageError(f"{file} has schema {schema!r}; this version reads {SCHEMA!r}")
+    result: dict[str, Any] = content
+    return result
+
+
+PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+PREFIXED = ("rad", "m", "rad/s", "m/s", "Nm", "N", "s")
+"""Units that people read with a prefix."""
+
+
+def si(value: float | None, unit: str, digits: int = 3) -> str:
+    """A number for people: ``0.000612, "rad"`` -> ``0.612 mrad``."""
+    if value is None or not math.isfinite(value):
+        return "unknown"
+    if unit in ("1", ""):
+        return f"{value:.{digits}g}"
+    if unit not in PREFIXED or value == 0:
+        return f"{value:.{digits}g} {unit}"
+    size = abs(value)
+    factor, prefix = next(((f, p) for f, p in PREFIXES if size >= f * 0.9995), PREFIXES[-1])
+    return f"{value / factor:.{digits}g} {prefix}{unit}"
+
+
+Kind = Literal["fit", "close", "replay"]
+
+
+def exit_code(result: Mapping[str, Any]) -> int:
+    """0, or 5 where a finished run told nothing: not converged, or not one parameter or effect identifiable.
+
+    A parameter that the log cannot tell beside others that it can is a finding, not a failure.
+    """
+    if result.get("converged") is False:
+        return 5
+    parameters = result["parameters"]
+    told = any(p["identifiable"] != "no" for p in parameters)
+    return 5 if parameters and not told and not result["effects"] else 0
