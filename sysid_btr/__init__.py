@@ -1,4 +1,4 @@
-"""Make a MuJoCo model move like the robot in a log: which parameters, how sure, and what the model is missing.
+"""Make a MuJoCo model move like the robot in a log: which parameters, how sure, what the model is missing.
 
 >>> import sysid_btr as sb
 >>> study = sb.make_study(sb.load_robot("leg.xml"), [sb.read_log("leg.parquet")])  # doctest: +SKIP

@@ -12,7 +12,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -58,23 +58,29 @@ def make_result(outcome: Fit | Closing, *, seed: int = 0, wall_s: float | None =
         {
             "schema": SCHEMA,
             **found,
-            "units": channel_units(study),
-            "numerics": {
-                "integrator": study.numerics.integrator,
-                "timestep": study.numerics.timestep,
-                "error_in_noise_floors": study.numerics_error,
-                "chosen": str(study.numerics),
-            },
-            "channels": study.channels,
+            **_provenance(study),
             "seed": seed,
-            "versions": versions(),
             "replays": outcome.replays,
             "wall_s": outcome.seconds if wall_s is None else wall_s,
-            "logs": _logs(study),
-            "model": model_entry(study.robot),
         }
     )
     return plain
+
+
+def _provenance(study: Study) -> dict[str, Any]:
+    return {
+        "units": channel_units(study),
+        "numerics": {
+            "integrator": study.numerics.integrator,
+            "timestep": study.numerics.timestep,
+            "error_in_noise_floors": study.numerics_error,
+            "chosen": str(study.numerics),
+        },
+        "channels": study.channels,
+        "versions": versions(),
+        "logs": _logs(study),
+        "model": model_entry(study.robot),
+    }
 
 
 def _of_fit(fit: Fit) -> dict[str, Any]:
@@ -114,6 +120,37 @@ def _of_closing(closing: Closing) -> dict[str, Any]:
         "steps": [_step(s) for s in closing.steps],
         "signature": closing.signature,
     }
+
+
+def replay_result(
+    study: Study, scores: Mapping[str, ChannelScore], parameters: Mapping[str, float], wall_s: float
+) -> dict[str, Any]:
+    """Content of a result of kind ``replay``: nothing is fitted, so all data counts as held out."""
+    unit = channel_units(study)
+    position = scores.get("position")
+    message = "the replay diverged"
+    if position is not None and math.isfinite(position.rmse):
+        message = (
+            f"position error {si(position.rmse, unit['position'].partition(',')[0])}, "
+            f"where the sensor's own noise is {si(position.floor, unit['position'].partition(',')[0])}."
+        )
+    plain: dict[str, Any] = clean(
+        {
+            "schema": SCHEMA,
+            "kind": "replay",
+            "message": message,
+            "noise_floor": {channel: s.floor for channel, s in scores.items()},
+            "nominal": {"train": {}, "holdout": channel_entries(scores)},
+            "set": dict(parameters),
+            "parameters": [],
+            "effects": [],
+            **_provenance(study),
+            "seed": None,
+            "replays": len(study.holdout),
+            "wall_s": wall_s,
+        }
+    )
+    return plain
 
 
 def estimate_entry(estimate: Estimate) -> dict[str, Any]:
@@ -285,9 +322,6 @@ def si(value: float | None, unit: str, digits: int = 3) -> str:
     size = abs(value)
     factor, prefix = next(((f, p) for f, p in PREFIXES if size >= f * 0.9995), PREFIXES[-1])
     return f"{value / factor:.{digits}g} {prefix}{unit}"
-
-
-Kind = Literal["fit", "close", "replay"]
 
 
 def exit_code(result: Mapping[str, Any]) -> int:

@@ -74,7 +74,7 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
     ----------
     path : folder; created with its parents.
     resume : go on with the journal of an earlier run.
-    overwrite : replace what an earlier run left; its journal is dropped now, its results when there are new ones.
+    overwrite : replace what an earlier run left: its journal now, its results once there are new ones.
 
     Raises
     ------
@@ -88,7 +88,9 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"--out {path} cannot be created: {error.strerror}; choose another folder") from error
+        raise UsageError(
+            f"--out {path} cannot be created: {error.strerror}; choose another folder"
+        ) from error
     folder = Folder(path)
     if folder.held and not (resume or overwrite):
         raise UsageError(
@@ -101,7 +103,9 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
     return folder
 
 
-def save(outcome: Fit | Closing, out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False) -> Path:
+def save(
+    outcome: Fit | Closing, out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False
+) -> Path:
     """Write result.json, overlay.png and report.html of a fit or a closing, as the command line does.
 
     Parameters

@@ -34,6 +34,8 @@ class Effect(Modifier):
     signed : whether its amounts may have either sign.
     structural : whether it adds joints to the model, which then has to be compiled for its places.
     main : kind whose value says how large the effect is.
+    steps : amounts the scan tries, in units of the kind's scale; more than one where the response bends.
+    includes : simpler effects that are special cases of this one.
     held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
     """
 
@@ -46,6 +48,8 @@ class Effect(Modifier):
     structural: ClassVar[bool] = False
     main: ClassVar[int] = 0
     held: ClassVar[tuple[str, ...]] = ()
+    steps: ClassVar[tuple[float, ...]] = (2.0,)
+    includes: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
@@ -76,7 +80,7 @@ class Effect(Modifier):
         kinds = cls.sized(scale)
         return tuple(
             (tuple(k.nominal + step * k.scale if i == cls.main else k.nominal for i, k in enumerate(kinds)),)
-            for step in (1.0, 4.0)
+            for step in cls.steps
         )
 
     @classmethod

@@ -18,6 +18,7 @@ class CoulombFriction(Effect):
     name: ClassVar[str] = "coulomb_friction"
     title: ClassVar[str] = "dry friction"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.05),)
+    steps: ClassVar[tuple[float, ...]] = (1.0, 4.0)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("stribeck_friction", "slow motion below the Stribeck velocity"),
         ("load_friction", "the same motion under different loads"),

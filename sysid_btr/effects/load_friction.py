@@ -20,6 +20,7 @@ class LoadFriction(Effect):
     title: ClassVar[str] = "friction per unit of load"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("ratio", "1", 0.0, 0.0, 0.9, 0.08),)
+    steps: ClassVar[tuple[float, ...]] = (1.0, 4.0)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("coulomb_friction", "the same motion under different loads"),
     )

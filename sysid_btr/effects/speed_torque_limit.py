@@ -24,6 +24,7 @@ class SpeedTorqueLimit(Effect):
         Kind("stall", "Nm", 100.0, 0.01, 100.0, 0.1),
         Kind("no_load_speed", "rad/s", 100.0, 0.1, 100.0, 0.5),
     )
+    includes: ClassVar[tuple[str, ...]] = ("torque_limit",)
     held: ClassVar[tuple[str, ...]] = ("stall", "no_load_speed")
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("torque_limit", "the limit reached at several speeds"),

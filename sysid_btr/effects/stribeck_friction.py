@@ -28,6 +28,7 @@ class StribeckFriction(Effect):
         Kind("static", "Nm", 0.0, 0.0, 10.0, 0.05),
         Kind("velocity", "rad/s", 0.1, 0.01, 3.0, 0.05),
     )
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
     main: ClassVar[int] = 1
     held: ClassVar[tuple[str, ...]] = ("velocity",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (

@@ -13,7 +13,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.models.fields import FIELDS, FieldModifier, Scope, nominal_value
 from sysid_btr.models.modifier import Parameter
 from sysid_btr.models.robot import Robot, body_names, joint_names, servo_joints
-from sysid_btr.models.scales import JointScale, Scales
+from sysid_btr.models.scales import SLIDE_UNITS, JointScale, Scales
 
 if TYPE_CHECKING:
     import mujoco
@@ -144,8 +144,15 @@ def _limits(
     if not math.isfinite(nominal):
         nominal = upper
     lower, upper = _own_bounds(parameter.name, field, place, robot.bounds, (lower, upper))
-    unit = parameter.unit if scale is None else scale.unit(parameter.unit)
+    unit = SLIDE_UNITS.get(parameter.unit, parameter.unit) if _slides(model, place) else parameter.unit
     return Parameter(parameter.name, unit, nominal, lower, upper, size)
+
+
+def _slides(model: mujoco.MjModel, place: str) -> bool:
+    import mujoco
+
+    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return any(model.joint(i).name == place and model.jnt_type[i] == slide for i in range(model.njnt))
 
 
 def _own_bounds(

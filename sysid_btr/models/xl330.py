@@ -65,7 +65,7 @@ class Supply(Modifier):
         for joint, column in zip(self.places, index, strict=True):
             voltage = step.inputs.get(f"voltage.{joint}", np.float64(self.nominal))
             enabled = step.inputs.get(f"enabled.{joint}", np.float64(1.0))
-            ratio = voltage / self.nominal * (enabled > 0.5)
+            ratio = voltage / self.nominal * enabled
             step.gain[:, column] *= ratio
             step.limit_low[:, column] *= ratio
             step.limit_high[:, column] *= ratio

@@ -18,7 +18,7 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import ModelError
 from sysid_btr.models.modifier import Index, Modifier, Outputs, Parameter, Rig, Step
 from sysid_btr.models.robot import Robot
-from sysid_btr.replay.grid import Grid, at_samples, make_grid
+from sysid_btr.replay.grid import Grid, at_samples, make_grid, mean_over_steps
 from sysid_btr.replay.quiet import quiet
 from sysid_btr.replay.start import initial_state
 
@@ -32,6 +32,8 @@ CHUNK = 32
 """Candidates simulated together; enough to share the cost of a Python step, few enough for the cache."""
 SEGMENT = 1024
 """Steps per rollout call; bounds the records that are held at once."""
+LIFT = 1.0
+"""m, by which a robot that is held is lifted from where its model stands."""
 LINK_SUFFIX = "__link"
 """Name ending of the second joint that play or compliance adds on the link side."""
 
@@ -405,6 +407,8 @@ def compile_model(
     if log.meta.mount == "fixed":
         for joint in list(spec.joints):
             if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+                # a robot that is held hangs clear of the ground it would otherwise stand on
+                joint.parent.pos = np.array(joint.parent.pos) + [0.0, 0.0, LIFT]
                 spec.delete(joint)
     # friction as stiff as the step allows: the default creeps and blurs reversals
     constant = max(2 * numerics.timestep, 0.002)
@@ -453,15 +457,18 @@ def law_index(index: Index, modifier: Modifier) -> IntArray:
 
 
 def step_inputs(log: Log, grid: Grid) -> dict[str, FloatArray]:
-    """Measured drive inputs a law may use, held over each step: supply voltage and enabled flags."""
+    """Measured drive inputs a law may use, (steps,) each: means of supply voltage and enabled flags.
+
+    A missing value leaves the one before it in force; a column without any value is left out.
+    """
     inputs: dict[str, FloatArray] = {}
-    borders = np.arange(grid.steps) * grid.timestep
-    rows = np.clip(
-        np.searchsorted(grid.sample_time, borders + 1e-9, side="right") - 1, 0, len(grid.sample_time) - 1
-    )
     for name, values in log.channels.items():
-        if name.split(".")[0] in ("voltage", "enabled"):
-            inputs[name] = values[rows]
+        known = np.flatnonzero(np.isfinite(values))
+        if name.split(".")[0] not in ("voltage", "enabled") or len(known) == 0:
+            continue
+        last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
+        held = np.asarray(values, dtype=np.float64)[known[last], None]
+        inputs[name] = mean_over_steps(grid.sample_time, held, grid.timestep, grid.steps)[:, 0]
     return inputs
 
 

@@ -108,11 +108,31 @@ def _mean_command(
         result[:, columns] = command_at(log, named, log.time[0] + (borders[:-1] + timestep / 2))
         return result
     held = command_at(log, named, log.time)
+    result[:, columns] = mean_over_steps(time, held, timestep, steps)
+    return result
+
+
+def mean_over_steps(time: FloatArray, held: FloatArray, timestep: float, steps: int) -> FloatArray:
+    """Mean over each step of values held from one sample to the next.
+
+    Parameters
+    ----------
+    time : (n,) s since the start of the grid, increasing.
+    held : (n, k); the last one stays.
+    timestep : s.
+    steps : number of steps.
+
+    Returns
+    -------
+    (steps, k) array.
+    """
+    borders = np.arange(steps + 1) * timestep
     span = np.diff(time, append=max(time[-1], borders[-1]) + timestep)
-    integral = np.vstack([np.zeros(len(named)), np.cumsum(held * span[:, None], axis=0)])
+    # relative to the first value, so that the cumulative sum keeps its digits
+    change = held - held[0]
+    integral = np.vstack([np.zeros(held.shape[1]), np.cumsum(change * span[:, None], axis=0)])
     knots = np.append(time, time[-1] + span[-1])
-    # relative to the first command, so that the cumulative sum keeps its digits
-    for column, values in zip(columns, integral.T, strict=True):
-        area = np.interp(borders, knots, values)
-        result[:, column] = np.diff(area) / timestep
+    result = np.empty((steps, held.shape[1]))
+    for k in range(held.shape[1]):
+        result[:, k] = held[0, k] + np.diff(np.interp(borders, knots, integral[:, k])) / timestep
     return result

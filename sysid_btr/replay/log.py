@@ -79,9 +79,7 @@ def replay_log(
     )
 
 
-def set_parameters(
-    robot: Robot, parameters: Mapping[str, float]
-) -> tuple[tuple[Modifier, ...], FloatArray]:
+def set_parameters(robot: Robot, parameters: Mapping[str, float]) -> tuple[tuple[Modifier, ...], FloatArray]:
     """Modifiers that hold parameters at given values, and these values in order, (p,).
 
     Raises

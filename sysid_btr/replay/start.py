@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log
 
 FIT_SAMPLES = 7
-"""Samples of the straight line whose value and slope are the start."""
+"""Samples of the polynomial whose value and slope are the start."""
 
 
 def initial_state(log: Log, joints: tuple[str, ...], defaults: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Filtered positions and velocities at the first sample, (j,) each.
 
-    A line through the first samples averages the encoder's noise; a joint without a position channel
-    starts at the model's default.
+    A line through the first samples averages the encoder's noise, a parabola where their curvature stands
+    out of it; a joint without a position channel starts at the model's default.
     """
     qpos, qvel = defaults.copy(), np.zeros(len(joints))
     for i, joint in enumerate(joints):
@@ -33,8 +33,21 @@ def initial_state(log: Log, joints: tuple[str, ...], defaults: FloatArray) -> tu
         if len(good) < 3:
             qpos[i] = values[good[0]]
             continue
-        slope, intercept = np.polyfit(time, values[good], 1)
-        qpos[i], qvel[i] = intercept, slope
+        qpos[i], qvel[i] = _value_and_slope(time, values[good])
         if log.has("velocity", joint) and np.isfinite(log.channels[f"velocity.{joint}"][0]):
             qvel[i] = log.channels[f"velocity.{joint}"][0]
     return qpos, qvel
+
+
+def _value_and_slope(time: FloatArray, values: FloatArray) -> tuple[float, float]:
+    """At time zero, by the lowest polynomial that the noise leaves room for (F test, 1 %)."""
+    from numpy.polynomial.polynomial import polyfit, polyval
+    from scipy.special import fdtri
+
+    line, bent = (polyfit(time, values, degree) for degree in (1, 2))
+    free = len(values) - 3
+    if free > 0:
+        rest = [float(np.sum((polyval(time, c) - values) ** 2)) for c in (line, bent)]
+        if rest[0] - rest[1] > fdtri(1, free, 0.99) * rest[1] / free:
+            return float(bent[0]), float(bent[1])
+    return float(line[0]), float(line[1])

@@ -1,0 +1,111 @@
+"""The study file: every flag of the command line in TOML, so that a study can be kept beside its logs."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from sysid_btr.errors import UsageError
+
+
+class StudyFile(BaseModel):
+    """What a study file may hold; keys are the flags' names, with ``-`` or ``_``.
+
+    Paths of model, logs and held-out logs are looked for beside the file first, then where the command runs.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    model: str | None = None
+    log: str | list[str] | None = None
+    holdout: float | str | list[str] | None = None
+    fit: str | list[str] | None = None
+    effects: str | list[str] | None = None
+    start: dict[str, float] | None = None
+    bounds: dict[str, tuple[float, float]] | None = Field(default=None)
+    set: dict[str, float] | None = None
+    channels: str | list[str] | None = None
+    estimator: str | None = None
+    max_evaluations: int | None = None
+    seed: int | None = None
+    threads: int | None = None
+    out: str | None = None
+    json_: bool | None = Field(default=None, alias="json")
+    resume: bool | None = None
+    overwrite: bool | None = None
+
+    @field_validator("bounds", mode="before")
+    @classmethod
+    def _as_pair(cls, value: Any) -> Any:
+        """TOML has lists only; strict mode wants tuples."""
+        if not isinstance(value, dict):
+            return value
+        return {k: tuple(map(float, v)) if _two_numbers(v) else v for k, v in value.items()}
+
+    def flags(self, folder: Path) -> dict[str, Any]:
+        """Defaults for the command line's parameters, as text where the command line takes text."""
+        flags: dict[str, Any] = {
+            "log": [_beside(folder, p) for p in _listed(self.log)],
+            "holdout": [_beside(folder, p) for p in _listed(self.holdout)],
+            "fit": _listed(self.fit),
+            "effects": _listed(self.effects),
+            "channels": _listed(self.channels),
+            "start": [f"{name}={value!r}" for name, value in (self.start or {}).items()],
+            "set_": [f"{name}={value!r}" for name, value in (self.set or {}).items()],
+            "bounds": [f"{name}={low!r}:{high!r}" for name, (low, high) in (self.bounds or {}).items()],
+            "model": None if self.model is None else _beside(folder, self.model),
+            **{
+                name: getattr(self, name)
+                for name in ("estimator", "max_evaluations", "seed", "threads", "out", "json_")
+            },
+            "resume": self.resume,
+            "overwrite": self.overwrite,
+        }
+        return {name: value for name, value in flags.items() if value is not None and value != []}
+
+
+def read_study_file(path: Path) -> dict[str, Any]:
+    """Defaults that a study file gives to the command line.
+
+    Raises
+    ------
+    UsageError
+        If it cannot be read, is not TOML, or holds a key or value that no flag has; all of them at once.
+    """
+    try:
+        with path.open("rb") as file:
+            content = tomllib.load(file)
+    except OSError as error:
+        raise UsageError(f"--config {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"--config {path} is not TOML: {error}") from error
+    try:
+        study = StudyFile.model_validate({key.replace("-", "_"): value for key, value in content.items()})
+    except ValidationError as error:
+        known = ", ".join(f.alias or name for name, f in StudyFile.model_fields.items())
+        lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        listing = "\n".join(dict.fromkeys(lines))
+        raise UsageError(f"--config {path}:\n{listing}\nknown keys: {known}") from error
+    return study.flags(path.parent)
+
+
+def _two_numbers(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    )
+
+
+def _listed(value: float | str | list[str] | None) -> list[str]:
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [str(value)]
+
+
+def _beside(folder: Path, name: str) -> str:
+    beside = folder / name
+    return str(beside) if beside.exists() else name

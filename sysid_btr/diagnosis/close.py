@@ -1,0 +1,368 @@
+"""Closing the loop: find the residual, trace it to an effect the model lacks, add it, report before and after.
+
+Fit what is declared; scan every effect at every place; refit the leading hypotheses; let held-out data
+decide; add the winner; repeat; prune. An effect is named only if held-out data say so, and only if in the
+end nearly all of the excess error is explained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord, Verdict
+from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
+from sysid_btr.diagnosis.refit import Fitted, judge, paired_t, refit, shorten
+from sysid_btr.diagnosis.scan import Question, Trace, questions, scan
+from sysid_btr.diagnosis.signature import proposals, signature
+from sysid_btr.diagnosis.words import message_of, sentence_of
+from sysid_btr.effects.base import Effect
+from sysid_btr.effects.library import EFFECTS, select_effects
+from sysid_btr.estimators.base import Progress, silent
+from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.fit import as_modifiers, fit, numerics_shift
+from sysid_btr.identify.intervals import Estimate, estimates
+from sysid_btr.identify.scores import score
+from sysid_btr.identify.study import Study, nominal_start
+from sysid_btr.models.modifier import Modifier
+from sysid_btr.models.robot import body_names, joint_names, servo_joints
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+
+SCAN_SECONDS = 15.0
+"""Part of each log that is scanned; the leading hypotheses are refitted on more."""
+REFIT_SECONDS = 20.0
+MAX_ROUNDS = 6
+REFITS = 7
+"""Hypotheses refitted in each round."""
+SIMPLER = 1.02
+"""A simpler hypothesis wins if its held-out chi2 is within this factor of the best one's."""
+NEAR = 0.93
+"""A rival that explains at least this fraction of what the winner does is confused with it."""
+STEP_GAIN = 0.03
+"""An effect must remove this fraction of the held-out chi2, and of the excess at its joints."""
+STEP_T = 3.0
+"""... with this paired t over half-second stretches of held-out data."""
+EXPLAINED = 0.85
+"""Fraction of the held-out excess that must be gone for effects to be named."""
+AT_FLOOR = 1.10
+"""Held-out chi2 up to which a log shows nothing more: noise floors are known to a few percent."""
+AMOUNT_T = 4.0
+"""An amount less than this many standard errors from neutral is pruned."""
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The model so far."""
+
+    fitted: Fitted
+    effects: tuple[Effect, ...]
+    rivals: tuple[tuple[Hypothesis, Fitted], ...] = ()
+
+
+def close(
+    study: Study,
+    parameters: Sequence[str] | Sequence[Modifier],
+    *,
+    effects: Sequence[str] = ("all",),
+    rng: Generator | None = None,
+    journal: Journal | None = None,
+    progress: Progress = silent,
+) -> Closing:
+    """Name the effects that a model lacks.
+
+    Parameters
+    ----------
+    study : robot and logs.
+    parameters : what is declared free, as for `fit`.
+    effects : names of the effects to consider, or ``all``.
+    rng : for estimators that draw; not used by the default ones.
+    journal, progress : see `sysid_btr.estimators`.
+
+    Returns
+    -------
+    Closing
+        Verdict, effects with intervals, candidates, steps.
+    """
+    began = perf_counter()
+    library = usable_effects(select_effects(effects), study)
+    first = fit(study, parameters, rng=rng, journal=journal, progress=progress)
+    study = first.study
+    declared = first.modifiers
+    before = judge(study, declared, first.values, first.replays)
+    state = _State(before, ())
+    steps = [StepRecord((), (), before.train, before.holdout)]
+    replays = first.replays
+    candidates: list[Candidate] = []
+    note = "scan"
+    for round_number in range(1, MAX_ROUNDS + 1):
+        if state.fitted.holdout <= 1.0 and state.fitted.train <= 1.0:
+            break
+        progress(done=round_number, total=None, best=state.fitted.holdout, note=f"round {round_number}: {note}")
+        traces, residual = _scan(study, state, library)
+        replays += len(traces)
+        hypotheses = form_hypotheses(traces, len(residual), REFITS)
+        trials: list[tuple[Hypothesis, Fitted]] = []
+        for hypothesis in hypotheses:
+            progress(
+                done=round_number,
+                total=None,
+                best=state.fitted.holdout,
+                note=f"round {round_number}: refit with {hypothesis}",
+            )
+            trials.append((hypothesis, _try(study, state, hypothesis)))
+            replays += trials[-1][1].evaluations
+        if not candidates or state.effects:
+            candidates += _candidates(state.fitted, trials)
+        winner = _choose(state.fitted, trials)
+        if winner is None:
+            break
+        hypothesis, fitted = winner
+        rivals = tuple((h, f) for h, f in trials if _rivals(state.fitted, winner, (h, f)))
+        state = _State(fitted, (*state.effects, hypothesis.modifier(study.scales)), (*state.rivals, *rivals))
+        steps.append(StepRecord((str(hypothesis),), (), fitted.train, fitted.holdout))
+    state, removed, spent = _prune(study, state, declared)
+    replays += spent
+    if removed:
+        steps.append(StepRecord((), removed, state.fitted.train, state.fitted.holdout))
+    if state.effects:
+        progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="final fit")
+        polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True)
+        replays += polished.evaluations
+        if polished.train <= state.fitted.train:
+            state = replace(state, fitted=polished)
+    final_estimates, study, state = _estimates(study, state)
+    count = sum(len(m.parameters) for m in declared)
+    verdict = _verdict(before, state)
+    named = _named(study, state, before, final_estimates[count:], declared) if state.effects else ()
+    kept = named if verdict in ("explained", "ambiguous") else ()
+    left = None
+    if verdict == "unexplained":
+        left = signature(study, state.fitted.modifiers, state.fitted.values)
+    after = score(study, state.fitted.modifiers, state.fitted.values)
+    return Closing(
+        study=study,
+        verdict=verdict,
+        message=message_of(verdict, kept, first.before, after, left),
+        noise_floor={c: s.floor for c, s in first.before.holdout.items()},
+        nominal=first.nominal,
+        before=first.before,
+        after=after,
+        parameters=final_estimates[:count] if state.effects else first.estimates,
+        effects=kept,
+        candidates=tuple(sorted(candidates, key=lambda c: -c.explained)),
+        steps=tuple(steps),
+        signature=left,
+        before_modifiers=declared,
+        before_values=first.values,
+        modifiers=state.fitted.modifiers,
+        values=state.fitted.values,
+        replays=replays,
+        seconds=perf_counter() - began,
+    )
+
+
+def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
+    """Effects that these logs could show at all, given mount and channels."""
+    free = any(log.meta.mount == "free" for log in study.train)
+    effort = "effort" in study.channels and any(log.joints("effort") for log in study.train)
+    result = []
+    for effect in effects:
+        if effect.name.startswith("foot_") and not free:
+            continue
+        if effect.name == "sensor_delay" and not effort:
+            continue  # the same as a command delay where nothing else is measured
+        result.append(effect)
+    return tuple(result)
+
+
+def _scan(
+    study: Study, state: _State, library: Sequence[type[Effect]]
+) -> tuple[list[Trace], FloatArray]:
+    short = shorten(study, SCAN_SECONDS)
+    problem = short.train_problem(state.fitted.modifiers, state.fitted.values)
+    residual, jacobian = linearise(problem, state.fitted.values)
+    places = {
+        "joint": joint_names(study.robot),
+        "servo": servo_joints(study.robot),
+        "body": body_names(study.robot),
+        "robot": ("robot",),
+    }
+    asked: list[Question] = questions(library, places, study.scales)
+    asked += proposals(study, problem, state.fitted.values, residual, library)
+    # an effect already at a place is not asked for again; it is refitted with everything else
+    present = {(type(e), p) for e in state.effects for p in e.places}
+    split = {p for e in state.effects if e.structural for p in e.places}
+    asked = [
+        q
+        for q in asked
+        if (q.effect, q.place) not in present and not (q.effect.structural and q.place in split)
+    ]
+    return scan(problem, state.fitted.values, residual, jacobian, asked, study.scales), residual
+
+
+def _try(study: Study, state: _State, hypothesis: Hypothesis) -> Fitted:
+    modifiers = (*state.fitted.modifiers, hypothesis.modifier(study.scales))
+    start = np.concatenate([state.fitted.values, hypothesis.start])
+    found = refit(shorten(study, REFIT_SECONDS), modifiers, start)
+    return judge(study, modifiers, found.values, found.evaluations)
+
+
+def _gain(before: Fitted, after: Fitted) -> float:
+    """Fraction of the held-out excess over the floor that is gone."""
+    excess = max(before.holdout - 1.0, 1e-9)
+    return (before.holdout - after.holdout) / excess
+
+
+def _choose(
+    before: Fitted, trials: Sequence[tuple[Hypothesis, Fitted]]
+) -> tuple[Hypothesis, Fitted] | None:
+    """The simplest of the best hypotheses, if held-out data want one at all."""
+    sound = [(h, f) for h, f in trials if np.isfinite(f.holdout) and _accepted(before, f)]
+    if not sound:
+        return None
+    best = min(f.holdout for _, f in sound)
+    near = [(h, f) for h, f in sound if f.holdout <= SIMPLER * best]
+    return min(near, key=lambda t: (t[0].size, t[1].holdout))
+
+
+def _accepted(before: Fitted, after: Fitted) -> bool:
+    """Whether the improvement on held-out data is large and not by chance."""
+    drop = (before.holdout - after.holdout) / before.holdout
+    local = float(np.max((before.holdout_columns - after.holdout_columns) / before.holdout_columns))
+    t = paired_t(after.holdout_blocks, before.holdout_blocks)
+    return (drop > STEP_GAIN or local > 5 * STEP_GAIN) and t > STEP_T and after.train < before.train
+
+
+def _rivals(
+    before: Fitted, winner: tuple[Hypothesis, Fitted], other: tuple[Hypothesis, Fitted]
+) -> bool:
+    """Whether another effect does nearly as well at the same joints, and held-out data cannot decide."""
+    hypothesis, fitted = winner
+    rival, alternative = other
+    if rival.effect.name == hypothesis.effect.name or hypothesis.effect.name in rival.effect.includes:
+        return False
+    if _gain(before, alternative) < NEAR * _gain(before, fitted):
+        return False
+    both_best = np.concatenate([fitted.holdout_blocks, fitted.train_blocks])
+    both_other = np.concatenate([alternative.holdout_blocks, alternative.train_blocks])
+    return paired_t(both_best, both_other) < STEP_T
+
+
+def _candidates(
+    before: Fitted, trials: Sequence[tuple[Hypothesis, Fitted]]
+) -> list[Candidate]:
+    ordered = sorted(trials, key=lambda t: t[1].holdout)
+    result = []
+    for h, f in ordered:
+        gain = _gain(before, f)
+        same = tuple(
+            dict.fromkeys(
+                o.effect.name
+                for o, g in ordered
+                if o.effect.name != h.effect.name and gain > 0 and abs(_gain(before, g) - gain) < (1 - NEAR) * gain
+            )
+        )
+        amplitude = float(f.values[len(f.values) - h.size + h.effect.main])
+        result.append(Candidate(h.effect.name, h.places, gain, amplitude, same))
+    return result
+
+
+def _prune(
+    study: Study, state: _State, declared: tuple[Modifier, ...]
+) -> tuple[_State, tuple[str, ...], int]:
+    """Backward pass: drop places whose amount is nothing, and effects without which nothing is lost."""
+    removed: list[str] = []
+    spent = 0
+    offset = sum(len(m.parameters) for m in declared)
+    if not state.effects:
+        return state, (), 0
+    if len(state.effects) > 1:
+        for effect in state.effects:
+            others = tuple(e for e in state.effects if e is not effect)
+            keep, column = list(range(offset)), offset
+            for e in state.effects:
+                size = len(e.parameters)
+                if e is not effect:
+                    keep += list(range(column, column + size))
+                column += size
+            trial = refit(study, (*declared, *others), state.fitted.values[keep])
+            spent += trial.evaluations
+            if not _accepted(trial, state.fitted) and len(others) == len(state.effects) - 1:
+                removed.append(f"{effect.name} at {', '.join(effect.places)}")
+                state = _State(trial, others, state.rivals)
+                if len(others) <= 1:
+                    break
+    return state, tuple(removed), spent
+
+
+def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study, _State]:
+    """Intervals in the final model, including what the step contributes."""
+    fitted = state.fitted
+    problem = study.train_problem(fitted.modifiers, fitted.values)
+    if not problem.parameters:
+        return (), study, state
+    residual, jacobian = linearise(problem, fitted.values)
+    jacobian = np.nan_to_num(jacobian)
+    shift = numerics_shift(problem, fitted.values, jacobian, residual)
+    return (
+        estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift),
+        study,
+        state,
+    )
+
+
+def _verdict(before: Fitted, state: _State) -> Verdict:
+    if not state.effects:
+        return "nothing_missing" if before.holdout <= AT_FLOOR else "unexplained"
+    if _gain(before, state.fitted) < EXPLAINED and state.fitted.holdout > AT_FLOOR:
+        return "unexplained"
+    return "ambiguous" if state.rivals else "explained"
+
+
+def _named(
+    study: Study,
+    state: _State,
+    before: Fitted,
+    found: Sequence[Estimate],
+    declared: tuple[Modifier, ...],
+) -> tuple[NamedEffect, ...]:
+    result, column = [], 0
+    offset = sum(len(m.parameters) for m in declared)
+    for effect in state.effects:
+        size = len(effect.parameters)
+        own = tuple(found[column : column + size])
+        without = state.fitted.values.copy()
+        without[offset + column : offset + column + size] = effect.neutral
+        off = judge(study, state.fitted.modifiers, without)
+        gain = (off.holdout - state.fitted.holdout) / max(off.holdout, 1e-12)
+        confused = tuple(
+            dict.fromkeys(
+                h.effect.name for h, _ in state.rivals if set(h.places) & set(effect.places) or not h.places
+            )
+        )
+        if effect.name == "command_delay" and "effort" not in study.channels:
+            confused = (*confused, "sensor_delay")
+        result.append(
+            NamedEffect(
+                effect=effect.name,
+                variant=effect.variant,
+                where=effect.places,
+                parameters=own,
+                gain_holdout=float(gain),
+                confused_with=confused,
+                sentence=sentence_of(effect, own),
+            )
+        )
+        column += size
+    return tuple(result)
+
+
+__all__ = ["EFFECTS", "as_modifiers", "close", "nominal_start", "usable_effects"]

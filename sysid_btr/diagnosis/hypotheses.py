@@ -1,0 +1,148 @@
+"""From traces to hypotheses: one effect at one place, at several places, or the same at all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.scan import Trace
+from sysid_btr.effects.base import Effect
+from sysid_btr.models.scales import Scales
+
+NEW_PLACE = 0.02
+"""A further place must explain this fraction of what its effect explains at all places so far."""
+WORTH_TRYING = 40.0
+"""Decrease of the sum of squared whitened residuals below which a place is noise (a scan asks many questions)."""
+EVEN = 0.35
+"""Relative spread of amounts within which places may share one."""
+RIVAL = 0.35
+"""A place joins a group only if this effect explains there at least this fraction of what the best effect does."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """An effect at some places, and where its refit begins.
+
+    Attributes
+    ----------
+    effect, places, shared : what is added.
+    start : (parameters,) first guess.
+    gain : decrease of the sum of squares that the linear scan promises.
+    """
+
+    effect: type[Effect]
+    places: tuple[str, ...]
+    shared: bool
+    start: FloatArray
+    gain: float
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self.start)
+
+    def modifier(self, scales: Scales) -> Effect:
+        return self.effect.at(self.places, scales, shared=self.shared)
+
+    def __str__(self) -> str:
+        places = ", ".join(self.places) if len(self.places) < 5 else f"{len(self.places)} places"
+        return f"{self.effect.name} at {places}"
+
+
+def form_hypotheses(traces: Sequence[Trace], residuals: int, most: int) -> list[Hypothesis]:
+    """The most promising hypotheses of a scan, best first, of different effects as far as possible.
+
+    Parameters
+    ----------
+    traces : of a scan.
+    residuals : length of the residual vector.
+    most : how many to return.
+    """
+    best_at: dict[str, float] = {}
+    for trace in traces:
+        place = trace.question.place
+        best_at[place] = max(best_at.get(place, 0.0), trace.gain)
+    result: list[Hypothesis] = []
+    for effect in dict.fromkeys(t.question.effect for t in traces):
+        own = _best_probe_per_place([t for t in traces if t.question.effect is effect])
+        if own[0].gain < WORTH_TRYING:
+            continue
+        lead = own[0]
+        result.append(Hypothesis(effect, (lead.question.place,), False, lead.values, lead.gain))
+        candidates = [t for t in own if t.gain >= RIVAL * best_at[t.question.place]]
+        group, gain = _grow(lead, candidates, residuals)
+        if len(group) > 1:
+            places = tuple(t.question.place for t in group)
+            values = np.array([t.values for t in group])
+            result.append(Hypothesis(effect, places, False, values.ravel(), gain))
+            main = values[:, effect.main]
+            middle = float(np.median(main))
+            if np.all(np.abs(main - middle) <= EVEN * abs(middle)):
+                result.append(Hypothesis(effect, places, True, np.median(values, axis=0), gain))
+            elif len(group) > 2:
+                even = [t for t in group if abs(t.values[effect.main] - middle) <= EVEN * abs(middle)]
+                if len(even) >= 0.6 * len(own):
+                    everywhere = tuple(t.question.place for t in own)
+                    result.append(Hypothesis(effect, everywhere, True, np.median(values, axis=0), gain))
+    result.sort(key=lambda h: -h.gain)
+    return _varied(result, most)
+
+
+def _best_probe_per_place(traces: Sequence[Trace]) -> list[Trace]:
+    best: dict[str, Trace] = {}
+    for trace in traces:
+        place = trace.question.place
+        if place not in best or trace.gain > best[place].gain:
+            best[place] = trace
+    return sorted(best.values(), key=lambda t: -t.gain)
+
+
+def _grow(lead: Trace, candidates: Sequence[Trace], residuals: int) -> tuple[list[Trace], float]:
+    """Add places greedily while they explain something that those before do not (orthogonal matching)."""
+    group = [lead]
+    basis = _unit(lead, residuals, None)
+    target_gain = lead.gain
+    for trace in candidates:
+        if trace is lead:
+            continue
+        vector = _unit(trace, residuals, basis)
+        if vector is None or basis is None:
+            continue
+        # gain that is left after what the group explains, to first order
+        kept = float(np.linalg.norm(vector[:, -1])) if vector.size else 0.0
+        share = kept**2 if kept < 1 else 1.0
+        left = trace.gain * share
+        if left >= max(WORTH_TRYING, NEW_PLACE * target_gain):
+            group.append(trace)
+            target_gain += left
+            basis = np.column_stack([basis, vector[:, -1] / max(kept, 1e-300)])
+    return group, target_gain
+
+
+def _unit(trace: Trace, residuals: int, basis: FloatArray | None) -> FloatArray | None:
+    """The trace's own explanation as a unit vector, less what a basis spans; (residuals, 1)."""
+    full = np.zeros(residuals)
+    full[trace.rows] = trace.response @ trace.amounts
+    norm = float(np.linalg.norm(full))
+    if norm == 0:
+        return None
+    full /= norm
+    if basis is not None:
+        full = full - basis @ (basis.T @ full)
+    return full[:, None]
+
+
+def _varied(ranked: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
+    """Best first, but at most three hypotheses of one effect class, so that rivals get their turn."""
+    taken: dict[type[Effect], int] = {}
+    result = []
+    for hypothesis in ranked:
+        if taken.get(hypothesis.effect, 0) < 3:
+            taken[hypothesis.effect] = taken.get(hypothesis.effect, 0) + 1
+            result.append(hypothesis)
+        if len(result) == most:
+            break
+    return result

@@ -1,0 +1,59 @@
+"""The finding in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sysid_btr.diagnosis.closing import NamedEffect, Verdict
+from sysid_btr.effects.base import Effect
+from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.scores import Scores
+
+
+def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
+    """One effect with places, amounts and intervals."""
+    kinds = len(effect.kinds)
+    parts = []
+    for i, group in enumerate(effect.groups):
+        own = found[i * kinds : (i + 1) * kinds]
+        amounts = ", ".join(_amount(e, k.name, kinds > 1) for e, k in zip(own, effect.kinds, strict=True))
+        place = group.replace(",", ", ")
+        if group.count(",") >= 6:
+            place = f"{group.count(',') + 1} places ({', '.join(group.split(',')[:3])}, ...)"
+        parts.append(f"{place}: {amounts}")
+    return f"{effect.title}: " + "; ".join(parts)
+
+
+def _amount(estimate: Estimate, kind: str, label: bool) -> str:
+    half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    text = f"{estimate.value:.3g} +- {half:.2g}{unit}"
+    return f"{kind} {text}" if label else text
+
+
+def message_of(
+    verdict: Verdict,
+    effects: Sequence[NamedEffect],
+    before: Scores,
+    after: Scores,
+    left: Mapping[str, Any] | None,
+) -> str:
+    """The verdict in one sentence, with the held-out error before and after."""
+    channel = "position"
+    errors = ""
+    if channel in before.holdout and channel in after.holdout:
+        errors = (
+            f" Held-out {channel} error {before.holdout[channel].rmse:.3g} -> {after.holdout[channel].rmse:.3g} "
+            f"(noise floor {before.holdout[channel].floor:.3g})."
+        )
+    if verdict == "nothing_missing":
+        return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
+    if verdict == "unexplained":
+        hint = "" if not left else f" What is left is {left.get('summary', 'not characterised')}."
+        return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
+    listing = "; ".join(e.sentence for e in effects)
+    if verdict == "ambiguous":
+        other = ", ".join(dict.fromkeys(c for e in effects for c in e.confused_with))
+        return f"Ambiguous: the model lacks {listing}; this log cannot tell it from {other}." + errors
+    return f"The model lacks {listing}." + errors
