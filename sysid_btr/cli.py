@@ -32,9 +32,6 @@ Exit codes: 0 done; 1 a defect of this program; 2 usage; 3 a log cannot be used;
 does not fit the log; 5 finished and written, but the fit did not converge or the log tells not one of its
 parameters (some not identifiable beside others that are is a result: 0); 130 interrupted, journal kept.
 """
-DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
-"""What `close` frees where nothing is said: a wrong mass or gain must not pass for an effect."""
-NOTHING = "none"
 DEMO_OUT = "demo_out"
 
 app = typer.Typer(
@@ -61,26 +58,21 @@ def run(argv: Sequence[str]) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 1
     except Interrupted:
-        _remark("interrupted")
+        remark("interrupted")
         return InterruptedRun.exit_code
     except SysidError as error:
-        _remark(f"error: {error}")
+        remark(f"error: {error}")
         return error.exit_code
     except Exception as error:
         if "--debug" in argv:
             raise
-        _remark(
+        remark(
             f"internal error: {type(error).__name__}: {error}\n"
             "This is a defect of sysid-btr, not of your data. Run the command again with --debug and report "
             "what it prints, with the output of `sysid-btr --version`, to the project's issue tracker."
         )
         return 1
     return 0
-
-
-def _remark(text: str) -> None:
-    sys.stderr.write(text + "\n")
-    sys.stderr.flush()
 
 
 # --- options, the same for every verb ------------------------------------------------------------------
@@ -263,11 +255,11 @@ def replay(
     from sysid_btr.result import replay_result
 
     began = time.perf_counter()
-    robot = _robot(model, None)
-    logs = _read_logs(log)
-    parameters = dict(_assignments("--set", set_))
+    robot = find_robot(model, None)
+    logs = read_logs(log)
+    parameters = dict(assignments("--set", set_))
     modifiers, values = set_parameters(robot, parameters)
-    targets = _replay_targets(out, logs, overwrite)
+    targets = replay_targets(out, logs, overwrite)
     study = make_study(robot, logs, holdout=logs, channels=COMPARED, threads=threads)
     scores = score_problem(study.train_problem(modifiers), values)
     for path, one in zip(targets, logs, strict=False):
@@ -288,7 +280,7 @@ def replay(
         unit = result["units"]["position"].partition(",")[0]
         screen.print(joints_table(position.joints, unit))
     for path in targets:
-        _remark(f"predicted log: {path}")
+        remark(f"predicted log: {path}")
 
 
 @app.command()
@@ -320,14 +312,14 @@ def fit(
     from sysid_btr.estimators.base import Budget
     from sysid_btr.identify.fit import fit as fit_study
 
-    robot = _robot(model, bounds)
+    robot = find_robot(model, bounds)
     if not free:
-        raise UsageError(_what_can_be_freed(robot))
+        raise UsageError(what_can_be_freed(robot))
     chosen = get_estimator(estimator)
     request = Request(
         "fit",
         robot,
-        _read_logs(log),
+        read_logs(log),
         holdout,
         free,
         channels,
@@ -348,7 +340,7 @@ def fit(
             budget=Budget(evaluations=max_evaluations),
             journal=keeper.journal,
             progress=progress,
-            start=_start(parameters, start),
+            start=start_values(parameters, start),
         )
 
     _finish(request, keeper, job, as_json)
@@ -386,14 +378,14 @@ def close(
     """
     from sysid_btr.effects.library import select_effects
 
-    robot = _robot(model, bounds)
-    names = _split(effects) or ["all"]
+    robot = find_robot(model, bounds)
+    names = split_names(effects) or ["all"]
     select_effects(names)
-    declared = _declared(robot, free)
+    parameters = declared(robot, free)
     request = Request(
         "close",
         robot,
-        _read_logs(log),
+        read_logs(log),
         holdout,
         declared,
         channels,
@@ -436,87 +428,16 @@ def demo(
     from sysid_btr.demo import cases
 
     for case in cases():
-        _remark(f"\n== {case.title}\n$ {case.command(out)}")
-        robot = _robot(case.model, None)
-        request = Request("close", robot, _read_logs([case.log]), None, list(case.free), None, threads, 0, {})
+        remark(f"\n== {case.title}\n$ {case.command(out)}")
+        robot = find_robot(case.model, None)
+        request = Request("close", robot, read_logs([case.log]), None, list(case.free), None, threads, 0, {})
         keeper = Keeper.open(out / case.name, False, True, request)
         code = _run(request, keeper, _closing_job(list(case.free), ["all"], 0, keeper), False)
         if code:
             raise typer.Exit(code)
 
 
-# --- what the verbs share -------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Request:
-    """What a fit or a closing was asked for."""
-
-    kind: str
-    robot: Robot
-    logs: list[Log]
-    holdout: list[str] | None
-    free: list[str]
-    channels: list[str] | None
-    threads: int
-    seed: int
-    settings: dict[str, Any]
-
-    def study(self) -> Study:
-        """Logs and model laid out; remarks on the logs go to stderr."""
-        from sysid_btr.identify.study import make_study
-        from sysid_btr.objectives.targets import FITTED
-
-        chosen = _channels(self.channels) or FITTED
-        for log in self.logs:
-            _warn(self.robot, log)
-        return make_study(
-            self.robot,
-            self.logs,
-            holdout=_holdout(self.holdout),
-            channels=chosen,
-            threads=self.threads,
-        )
-
-    def fingerprint(self) -> str:
-        """Digest of all that decides which candidates are evaluated."""
-        import hashlib
-        import json
-
-        from sysid_btr.io.parquet import sha256
-
-        held = [sha256(p) if Path(p).is_file() else p for p in self.holdout or []]
-        content = {
-            "version": __version__,
-            "kind": self.kind,
-            "model": self.robot.digest,
-            "logs": [sha256(log.path) for log in self.logs if log.path is not None],
-            "holdout": held,
-            "fit": self.free,
-            "channels": _channels(self.channels),
-            "seed": self.seed,
-            **self.settings,
-        }
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-@dataclass(frozen=True, eq=False)
-class Keeper:
-    """Where a run keeps what it finds: a folder and its journal, or memory alone."""
-
-    folder: Folder | None
-    journal: Journal
-
-    @classmethod
-    def open(cls, out: Path | None, resume: bool, overwrite: bool, request: Request) -> Keeper:
-        from sysid_btr.estimators.journal import Journal
-
-        if out is None:
-            if resume:
-                raise UsageError("--resume goes on with the journal of an earlier run: give its --out folder")
-            return cls(None, Journal())
-        folder = open_folder(out, resume=resume, overwrite=overwrite)
-        return cls(folder, Journal(folder.journal, fingerprint=request.fingerprint()))
+# --- what the verbs share --------------------------------------------------------------------------------
 
 
 def _closing_job(declared: list[str], effects: list[str], seed: int, keeper: Keeper) -> Job:
@@ -554,7 +475,7 @@ def _run(request: Request, keeper: Keeper, job: Job, as_json: bool) -> int:
     result = make_result(outcome, seed=request.seed, wall_s=time.perf_counter() - began)
     if keeper.folder is not None:
         page = write_all(keeper.folder, outcome, result)
-        _remark(f"report: {page}")
+        remark(f"report: {page}")
     if as_json:
         _print_json(result)
     else:
@@ -573,197 +494,10 @@ def _interrupted(keeper: Keeper, progress: ProgressLine) -> str:
     )
 
 
-def _robot(name: str | None, bounds: list[str] | None) -> Robot:
-    from dataclasses import replace
-
-    from sysid_btr.models.builtin import BUILTIN
-    from sysid_btr.models.robot import load_robot
-
-    if name is None:
-        built_in = f" ({', '.join(sorted(BUILTIN))})" if BUILTIN else ""
-        raise UsageError(f"which robot? Give --model: a built-in name{built_in} or an MJCF or URDF file")
-    robot = load_robot(name)
-    table = dict(_bounds(bounds))
-    return replace(robot, bounds={**robot.bounds, **table}) if table else robot
-
-
-def _read_logs(paths: Iterable[Path] | None) -> list[Log]:
-    """All logs, or one error that lists what is wrong with each of them."""
-    from sysid_btr.io.parquet import read_log
-
-    logs, problems = [], []
-    for path in paths or ():
-        try:
-            logs.append(read_log(path))
-        except LogError as error:
-            problems.append(str(error))
-    if problems:
-        raise LogError("\n".join(problems))
-    if not logs:
-        raise UsageError("which log? Give --log FILE, once for each log")
-    return logs
-
-
-def _warn(robot: Robot, log: Log) -> None:
-    """Remarks of the validation on a log that can be used all the same."""
-    from sysid_btr.io.validation import validate_log
-    from sysid_btr.models.robot import joint_names, joint_ranges
-
-    for problem in validate_log(log, joints=joint_names(robot), ranges=joint_ranges(robot)):
-        _remark(f"warning: {log.path}: {problem.where}: {problem.message} [{problem.code}]")
-
-
-def _holdout(given: list[str] | None) -> float | list[Log]:
-    if not given:
-        return 0.3
-    numbers = [_number(text) for text in given]
-    if len(given) == 1 and numbers[0] is not None:
-        return numbers[0]
-    if any(n is not None for n in numbers):
-        raise UsageError(f"--holdout takes one fraction or log files, not both: {', '.join(given)}")
-    return _read_logs([Path(text) for text in given])
-
-
-def _channels(given: list[str] | None) -> tuple[str, ...]:
-    from sysid_btr.objectives.targets import COMPARED
-
-    names = _split(given)
-    unknown = [name for name in names if name not in COMPARED]
-    if unknown:
-        raise UsageError(f"--channels: unknown {', '.join(unknown)}; a replay predicts {', '.join(COMPARED)}")
-    return tuple(names)
-
-
-def _declared(robot: Robot, free: list[str] | None) -> list[str]:
-    """What `close` frees."""
-    from sysid_btr.models.robot import servo_joints
-
-    if free == [NOTHING]:
-        return []
-    if free:
-        return free
-    declared = [p for p in DECLARED if p.startswith("mass") or servo_joints(robot)]
-    _remark(f"freeing {', '.join(declared)} (--fit says otherwise, --fit none nothing)")
-    return declared
-
-
-def _what_can_be_freed(robot: Robot) -> str:
-    from sysid_btr.models.fields import FIELDS
-    from sysid_btr.models.robot import body_names, joint_names, servo_joints
-
-    fields: dict[str, list[str]] = {}
-    for name, cls in FIELDS.items():
-        fields.setdefault(cls.scope, []).append(name)
-    lines = [
-        f"what shall be fitted? Give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has",
-    ]
-    for scope, names in (
-        ("body", body_names(robot)),
-        ("joint", joint_names(robot)),
-        ("servo", servo_joints(robot)),
-    ):
-        noun = {"body": "bodies", "joint": "joints", "servo": "joints with a servo"}[scope]
-        lines.append(f"  {', '.join(fields.get(scope, []))}\n    of {noun}: {', '.join(names) or 'none'}")
-    lines.append("for example: --fit 'mass:*' --fit 'kp:*=shared'")
-    return "\n".join(lines)
-
-
-def _start(parameters: Sequence[Parameter], given: list[str] | None) -> FloatArray:
-    """Where the search begins: the nominal values, but for those given by name or glob.
-
-    Raises
-    ------
-    UsageError
-        For names that no free parameter has, and values outside the bounds; all of them at once.
-    """
-    from fnmatch import fnmatchcase
-
-    import numpy as np
-
-    values = np.array([p.nominal for p in parameters])
-    problems = []
-    for name, value in _assignments("--start", given):
-        chosen = [i for i, p in enumerate(parameters) if p.name == name] or [
-            i for i, p in enumerate(parameters) if fnmatchcase(p.name, name)
-        ]
-        if not chosen:
-            problems.append(
-                f"{name} is not a free parameter; there are {', '.join(p.name for p in parameters)}"
-            )
-        for i in chosen:
-            p = parameters[i]
-            if not p.lower <= value <= p.upper:
-                problems.append(f"{p.name}={value:g} is outside its bounds {p.lower:g} to {p.upper:g}")
-            values[i] = value
-    if problems:
-        raise UsageError("--start: " + "\n  ".join(problems))
-    return values
-
-
-def _assignments(flag: str, given: list[str] | None) -> list[tuple[str, float]]:
-    pairs, problems = [], []
-    for text in given or ():
-        name, equals, right = text.rpartition("=")
-        value = _number(right)
-        if not equals or not name or value is None:
-            problems.append(f"{flag} {text}: expected NAME=NUMBER")
-        else:
-            pairs.append((name, value))
-    if problems:
-        raise UsageError("\n".join(problems))
-    return pairs
-
-
-def _bounds(given: list[str] | None) -> list[tuple[str, tuple[float, float]]]:
-    pairs, problems = [], []
-    for text in given or ():
-        name, _, right = text.rpartition("=")
-        low, _, high = right.partition(":")
-        lower, upper = _number(low), _number(high)
-        if not name or lower is None or upper is None or not lower < upper:
-            problems.append(f"--bounds {text}: expected NAME=LOW:HIGH with LOW < HIGH")
-        else:
-            pairs.append((name, (lower, upper)))
-    if problems:
-        raise UsageError("\n".join(problems))
-    return pairs
-
-
-def _number(text: str) -> float | None:
-    import math
-
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
-def _split(given: list[str] | None) -> list[str]:
-    return [name for text in given or () for name in text.split(",") if name]
-
-
 def _generator(seed: int) -> Any:
     import numpy as np
 
     return np.random.default_rng(seed)
-
-
-def _replay_targets(out: Path | None, logs: Sequence[Log], overwrite: bool) -> list[Path]:
-    """Where the predicted logs go; refused before any work if something is in the way."""
-    if out is None:
-        return []
-    targets = [out / f"{log.path.stem if log.path else 'log'}.replayed.parquet" for log in logs]
-    if len(set(targets)) < len(targets):
-        raise UsageError("two logs have the same file name, and so would their replays: run them one by one")
-    there = [str(path) for path in targets if path.exists()]
-    if there and not overwrite:
-        raise UsageError(f"{', '.join(there)} exists; --overwrite replaces it, or choose another --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"--out {out} cannot be created: {error.strerror}; choose another folder") from error
-    return targets
 
 
 def _print_json(content: Any) -> None:

@@ -54,17 +54,19 @@ EXPLAINED = 0.85
 """Fraction of the held-out excess that must be gone for effects to be named."""
 AT_FLOOR = 1.10
 """Held-out chi2 up to which a log shows nothing more: noise floors are known to a few percent."""
-AMOUNT_T = 4.0
-"""An amount less than this many standard errors from neutral is pruned."""
+FLOOR_ALL, FLOOR_COLUMN = 1.03, 1.12
+"""Chi2 of all columns and of the worst one at which there is nothing to look for."""
+EVEN_SPREAD = 0.05
+"""Relative spread of amounts that are one amount, whatever their standard errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The model so far."""
+    """The model so far: `rivals` are the names that each effect may be confused with."""
 
     fitted: Fitted
     effects: tuple[Effect, ...]
-    rivals: tuple[tuple[Hypothesis, Fitted], ...] = ()
+    rivals: tuple[tuple[str, ...], ...] = ()
 
 
 def close(
@@ -103,7 +105,7 @@ def close(
     candidates: list[Candidate] = []
     note = "scan"
     for round_number in range(1, MAX_ROUNDS + 1):
-        if state.fitted.holdout <= 1.0 and state.fitted.train <= 1.0:
+        if _at_floor(state.fitted):
             break
         progress(done=round_number, total=None, best=state.fitted.holdout, note=f"round {round_number}: {note}")
         traces, residual = _scan(study, state, library)
@@ -125,19 +127,21 @@ def close(
         if winner is None:
             break
         hypothesis, fitted = winner
-        rivals = tuple((h, f) for h, f in trials if _rivals(state.fitted, winner, (h, f)))
-        state = _State(fitted, (*state.effects, hypothesis.modifier(study.scales)), (*state.rivals, *rivals))
+        rivals = tuple(
+            dict.fromkeys(h.effect.name for h, f in trials if _rivals(state.fitted, winner, (h, f)))
+        )
+        state = _State(fitted, (*state.effects, hypothesis.modifier(study.scales)), (*state.rivals, rivals))
         steps.append(StepRecord((str(hypothesis),), (), fitted.train, fitted.holdout))
     state, removed, spent = _prune(study, state, declared)
     replays += spent
     if removed:
         steps.append(StepRecord((), removed, state.fitted.train, state.fitted.holdout))
     if state.effects:
+        state = _merge(study, state, declared)
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="final fit")
         polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True)
         replays += polished.evaluations
-        if polished.train <= state.fitted.train:
-            state = replace(state, fitted=polished)
+        state = replace(state, fitted=polished)
     final_estimates, study, state = _estimates(study, state)
     count = sum(len(m.parameters) for m in declared)
     verdict = _verdict(before, state)
@@ -203,7 +207,7 @@ def _scan(
     asked = [
         q
         for q in asked
-        if (q.effect, q.place) not in present and not (q.effect.structural and q.place in split)
+        if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
     ]
     return scan(problem, state.fitted.values, residual, jacobian, asked, study.scales), residual
 
@@ -213,6 +217,11 @@ def _try(study: Study, state: _State, hypothesis: Hypothesis) -> Fitted:
     start = np.concatenate([state.fitted.values, hypothesis.start])
     found = refit(shorten(study, REFIT_SECONDS), modifiers, start)
     return judge(study, modifiers, found.values, found.evaluations)
+
+
+def _at_floor(fitted: Fitted) -> bool:
+    """Whether neither the whole nor any single column has anything left to explain."""
+    return fitted.holdout <= FLOOR_ALL and float(fitted.columns.max()) <= FLOOR_COLUMN
 
 
 def _gain(before: Fitted, after: Fitted) -> float:
@@ -278,29 +287,49 @@ def _candidates(
 def _prune(
     study: Study, state: _State, declared: tuple[Modifier, ...]
 ) -> tuple[_State, tuple[str, ...], int]:
-    """Backward pass: drop places whose amount is nothing, and effects without which nothing is lost."""
+    """Backward pass: drop effects without which held-out data are predicted as well."""
     removed: list[str] = []
     spent = 0
     offset = sum(len(m.parameters) for m in declared)
-    if not state.effects:
-        return state, (), 0
-    if len(state.effects) > 1:
-        for effect in state.effects:
-            others = tuple(e for e in state.effects if e is not effect)
-            keep, column = list(range(offset)), offset
-            for e in state.effects:
-                size = len(e.parameters)
-                if e is not effect:
-                    keep += list(range(column, column + size))
-                column += size
-            trial = refit(study, (*declared, *others), state.fitted.values[keep])
-            spent += trial.evaluations
-            if not _accepted(trial, state.fitted) and len(others) == len(state.effects) - 1:
-                removed.append(f"{effect.name} at {', '.join(effect.places)}")
-                state = _State(trial, others, state.rivals)
-                if len(others) <= 1:
-                    break
+    for effect in state.effects[:-1] if len(state.effects) > 1 else ():
+        at = state.effects.index(effect)
+        others = state.effects[:at] + state.effects[at + 1 :]
+        first = offset + sum(len(e.parameters) for e in state.effects[:at])
+        values = np.delete(state.fitted.values, slice(first, first + len(effect.parameters)))
+        trial = refit(shorten(study, REFIT_SECONDS), (*declared, *others), values)
+        trial = judge(study, trial.modifiers, trial.values, trial.evaluations)
+        spent += trial.evaluations
+        if not _accepted(trial, state.fitted):
+            removed.append(f"{effect.name} at {', '.join(effect.places)}")
+            state = _State(trial, others, state.rivals[:at] + state.rivals[at + 1 :])
     return state, tuple(removed), spent
+
+
+def _merge(study: Study, state: _State, declared: tuple[Modifier, ...]) -> _State:
+    """Effects of one kind found in several rounds become one; amounts that agree become one amount."""
+    offset = sum(len(m.parameters) for m in declared)
+    pieces: dict[type[Effect], list[tuple[str, FloatArray]]] = {}
+    confused: dict[type[Effect], tuple[str, ...]] = {}
+    column = offset
+    for effect, rivals in zip(state.effects, state.rivals, strict=True):
+        size = len(effect.parameters)
+        amounts = effect.spread(state.fitted.values[None, column : column + size])[0]
+        pieces.setdefault(type(effect), []).extend(zip(effect.places, amounts, strict=True))
+        confused[type(effect)] = tuple(dict.fromkeys((*confused.get(type(effect), ()), *rivals)))
+        column += size
+    merged: list[Effect] = []
+    values = [state.fitted.values[:offset]]
+    for kind, found in pieces.items():
+        places = tuple(p for p, _ in found)
+        amounts = np.array([a for _, a in found])
+        main = amounts[:, kind.main]
+        middle = float(np.median(main))
+        even = len(found) > 2 and bool(np.all(np.abs(main - middle) <= EVEN_SPREAD * abs(middle)))
+        merged.append(kind.at(places, study.scales, shared=even))
+        values.append(np.median(amounts, axis=0) if even else amounts.ravel())
+    modifiers = (*declared, *merged)
+    fitted = replace(state.fitted, modifiers=modifiers, values=np.concatenate(values))
+    return _State(fitted, tuple(merged), tuple(confused.values()))
 
 
 def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study, _State]:
@@ -324,7 +353,7 @@ def _verdict(before: Fitted, state: _State) -> Verdict:
         return "nothing_missing" if before.holdout <= AT_FLOOR else "unexplained"
     if _gain(before, state.fitted) < EXPLAINED and state.fitted.holdout > AT_FLOOR:
         return "unexplained"
-    return "ambiguous" if state.rivals else "explained"
+    return "ambiguous" if any(state.rivals) else "explained"
 
 
 def _named(
@@ -336,18 +365,13 @@ def _named(
 ) -> tuple[NamedEffect, ...]:
     result, column = [], 0
     offset = sum(len(m.parameters) for m in declared)
-    for effect in state.effects:
+    for effect, confused in zip(state.effects, state.rivals, strict=True):
         size = len(effect.parameters)
         own = tuple(found[column : column + size])
         without = state.fitted.values.copy()
         without[offset + column : offset + column + size] = effect.neutral
         off = judge(study, state.fitted.modifiers, without)
         gain = (off.holdout - state.fitted.holdout) / max(off.holdout, 1e-12)
-        confused = tuple(
-            dict.fromkeys(
-                h.effect.name for h, _ in state.rivals if set(h.places) & set(effect.places) or not h.places
-            )
-        )
         if effect.name == "command_delay" and "effort" not in study.channels:
             confused = (*confused, "sensor_delay")
         result.append(

@@ -16,6 +16,8 @@ NEW_PLACE = 0.02
 """A further place must explain this fraction of what its effect explains at all places so far."""
 WORTH_TRYING = 40.0
 """Decrease of the sum of squared whitened residuals below which a place is noise (a scan asks many questions)."""
+MOST_NUMBERS = 24
+"""Parameters that one hypothesis may add."""
 EVEN = 0.35
 """Relative spread of amounts within which places may share one."""
 RIVAL = 0.35
@@ -62,18 +64,24 @@ def form_hypotheses(traces: Sequence[Trace], residuals: int, most: int) -> list[
     most : how many to return.
     """
     best_at: dict[str, float] = {}
-    for trace in traces:
+    single = [t for t in traces if len(t.question.places) == 1]
+    for trace in single:
         place = trace.question.place
         best_at[place] = max(best_at.get(place, 0.0), trace.gain)
     result: list[Hypothesis] = []
-    for effect in dict.fromkeys(t.question.effect for t in traces):
-        own = _best_probe_per_place([t for t in traces if t.question.effect is effect])
+    for trace in traces:
+        if len(trace.question.places) > 1 and trace.gain >= WORTH_TRYING:
+            question = trace.question
+            result.append(Hypothesis(question.effect, question.places, True, trace.values, trace.gain))
+    for effect in dict.fromkeys(t.question.effect for t in single):
+        own = _best_probe_per_place([t for t in single if t.question.effect is effect])
         if own[0].gain < WORTH_TRYING:
             continue
         lead = own[0]
         result.append(Hypothesis(effect, (lead.question.place,), False, lead.values, lead.gain))
         candidates = [t for t in own if t.gain >= RIVAL * best_at[t.question.place]]
         group, gain = _grow(lead, candidates, residuals)
+        group = group[: max(MOST_NUMBERS // len(effect.kinds), 1)]
         if len(group) > 1:
             places = tuple(t.question.place for t in group)
             values = np.array([t.values for t in group])
@@ -82,13 +90,8 @@ def form_hypotheses(traces: Sequence[Trace], residuals: int, most: int) -> list[
             middle = float(np.median(main))
             if np.all(np.abs(main - middle) <= EVEN * abs(middle)):
                 result.append(Hypothesis(effect, places, True, np.median(values, axis=0), gain))
-            elif len(group) > 2:
-                even = [t for t in group if abs(t.values[effect.main] - middle) <= EVEN * abs(middle)]
-                if len(even) >= 0.6 * len(own):
-                    everywhere = tuple(t.question.place for t in own)
-                    result.append(Hypothesis(effect, everywhere, True, np.median(values, axis=0), gain))
     result.sort(key=lambda h: -h.gain)
-    return _varied(result, most)
+    return _varied(_without_idle(result), most)
 
 
 def _best_probe_per_place(traces: Sequence[Trace]) -> list[Trace]:
@@ -133,6 +136,22 @@ def _unit(trace: Trace, residuals: int, basis: FloatArray | None) -> FloatArray 
     if basis is not None:
         full = full - basis @ (basis.T @ full)
     return full[:, None]
+
+
+def _without_idle(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Drop an effect that includes a simpler one and does no better at the lead place."""
+    best: dict[str, float] = {}
+    for h in ranked:
+        best[h.effect.name] = max(best.get(h.effect.name, 0.0), h.gain)
+    return [
+        h
+        for h in ranked
+        if not any(best.get(simple, 0.0) * BETTER >= h.gain for simple in h.effect.includes)
+    ]
+
+
+BETTER = 1.03
+"""A more general effect must promise this much more than the special case it includes."""
 
 
 def _varied(ranked: Sequence[Hypothesis], most: int) -> list[Hypothesis]:

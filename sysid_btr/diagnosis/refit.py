@@ -23,6 +23,7 @@ class Fitted:
     ----------
     modifiers, values : the model.
     train, holdout : mean square of error over noise floor.
+    holdout_columns, columns : the same for each log column, on held-out and on all data.
     train_blocks, holdout_blocks : sums of squares by stretch of half a second, for paired comparisons.
     count : (train, holdout) number of residuals.
     evaluations : candidates simulated.
@@ -35,6 +36,7 @@ class Fitted:
     train_blocks: FloatArray
     holdout_blocks: FloatArray
     holdout_columns: FloatArray
+    columns: FloatArray
     count: tuple[int, int]
     evaluations: int
 
@@ -72,11 +74,25 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
         holdout=float(s @ s) / len(s),
         train_blocks=_by_block(train, r),
         holdout_blocks=_by_block(holdout, s),
-        holdout_columns=np.bincount(holdout.column_labels, weights=s * s)
-        / np.maximum(np.bincount(holdout.column_labels), 1),
+        holdout_columns=_by_column(holdout, s),
+        columns=_pooled(train, r, holdout, s),
         count=(len(r), len(s)),
         evaluations=evaluations + 1,
     )
+
+
+def _by_column(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
+    labels, size = problem.column_labels, len(problem.columns)
+    return np.bincount(labels, residual**2, size) / np.maximum(np.bincount(labels, minlength=size), 1)
+
+
+def _pooled(train: ReplayProblem, r: FloatArray, holdout: ReplayProblem, s: FloatArray) -> FloatArray:
+    """Mean square by column over fitted and held-out data, where both have the same columns."""
+    if len(train.columns) != len(holdout.columns):
+        return np.concatenate([_by_column(train, r), _by_column(holdout, s)])
+    a, b = np.bincount(train.column_labels), np.bincount(holdout.column_labels)
+    total: FloatArray = (_by_column(train, r) * a + _by_column(holdout, s) * b) / np.maximum(a + b, 1)
+    return total
 
 
 def _by_block(problem: ReplayProblem, residual: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.effects.base import Effect, Probe, scale_at
+from sysid_btr.effects.base import Effect, Probe, middle_scale, scale_at
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.scales import Scales
 from sysid_btr.objectives.problem import ReplayProblem
@@ -24,11 +24,16 @@ NO_RESPONSE = 1e-6
 
 @dataclass(frozen=True)
 class Question:
-    """One effect at one place at one working point."""
+    """One effect at one place, or alike at several, at one working point."""
 
     effect: type[Effect]
-    place: str
+    places: tuple[str, ...]
     probe: Probe
+
+    @property
+    def place(self) -> str:
+        """The place, or the first of several."""
+        return self.places[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +61,20 @@ class Trace:
 def questions(
     effects: Sequence[type[Effect]], places: dict[str, tuple[str, ...]], scales: Scales
 ) -> list[Question]:
-    """All effects at all places of their scope, at all their working points."""
-    return [
-        Question(effect, place, probe)
+    """All effects at all places of their scope, and alike at all places at once, at all working points."""
+    asked = [
+        Question(effect, (place,), probe)
         for effect in effects
         for place in places[effect.scope]
         for probe in effect.probes(scale_at(scales, place))
     ]
+    asked += [
+        Question(effect, places[effect.scope], probe)
+        for effect in effects
+        if effect.everywhere and len(places[effect.scope]) > 1
+        for probe in effect.probes(middle_scale([scales[p] for p in places[effect.scope]]))
+    ]
+    return asked
 
 
 def scan(
@@ -115,7 +127,8 @@ def _orthonormal(jacobian: FloatArray) -> FloatArray:
 
 
 def _limb(question: Question, where: dict[str, int]) -> int:
-    return where.get(question.place, EVERYWHERE)
+    found = {where.get(place, EVERYWHERE) for place in question.places}
+    return found.pop() if len(found) == 1 else EVERYWHERE
 
 
 def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Question]]:
@@ -123,7 +136,8 @@ def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Qu
     where = limbs(problem.episodes[0].replay.model)
     result: list[list[Question]] = []
     for effect in dict.fromkeys(q.effect for q in asked):
-        own = [q for q in asked if q.effect is effect]
+        own = [q for q in asked if q.effect is effect and len(q.places) == 1]
+        result += [[q] for q in asked if q.effect is effect and len(q.places) > 1]
         waiting = list(dict.fromkeys(q.place for q in own))
         while waiting:
             used: set[int] = set()
@@ -152,7 +166,7 @@ def _ask(
     offset: dict[tuple[type[Effect], str], int] = {}
     column = len(values)
     for effect in dict.fromkeys(q.effect for q in asked):
-        places = tuple(dict.fromkeys(q.place for q in asked if q.effect is effect))
+        places = tuple(dict.fromkeys(p for q in asked if q.effect is effect for p in q.places))
         modifier = effect.at(places, scales)
         for i, place in enumerate(places):
             offset[effect, place] = column + i * len(effect.kinds)
@@ -173,8 +187,9 @@ def _ask(
     for row, job in enumerate(jobs, start=1):
         for i, d in job:
             question = asked[i]
-            at = offset[question.effect, question.place]
-            candidates[row, at : at + len(question.effect.kinds)] = question.probe[d]
+            for place in question.places:
+                at = offset[question.effect, place]
+                candidates[row, at : at + len(question.effect.kinds)] = question.probe[d]
     limb_of_row = wide._limbs[1]
     responses: dict[tuple[int, int], FloatArray | None] = {}
     rows_of = {limb: np.flatnonzero(limb_of_row == limb) for limb in lanes}

@@ -18,6 +18,7 @@ class Armature(Effect):
     name: ClassVar[str] = "armature"
     title: ClassVar[str] = "rotor inertia"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("inertia", "kg m2", 0.0, 0.0, 1.0, 0.001),)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("payload", "poses in which gravity pulls at the joint"),
         ("command_delay", "motion at several frequencies"),

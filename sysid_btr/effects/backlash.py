@@ -9,13 +9,12 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.effects.base import Effect, Probe
-from sysid_btr.models.modifier import Kind, Rig
+from sysid_btr.models.modifier import LINK_SUFFIX, Kind, Rig
 from sysid_btr.models.scales import JointScale
 
 if TYPE_CHECKING:
     import mujoco
 
-LINK = "__link"
 HELD = 1e-7
 
 
@@ -47,7 +46,7 @@ class Backlash(Effect):
         for name in self.places:
             joint = spec.joint(name)
             add_link_joint(spec, name, damping_on_link=self.variant == "link")
-            link = spec.joint(name + LINK)
+            link = spec.joint(name + LINK_SUFFIX)
             link.limited = True
             link.range = [-HELD, HELD]
             link.solref_limit = [2 * step, 1.0]
@@ -55,7 +54,7 @@ class Backlash(Effect):
             del joint
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = [rig.model.joint(name + LINK).id for name in self.places]
+        ids = [rig.model.joint(name + LINK_SUFFIX).id for name in self.places]
         half = np.maximum(values[:, :, 0] / 2, HELD)
         ranges = rig.array("jnt_range")
         ranges[:, ids, 0], ranges[:, ids, 1] = -half, half
@@ -74,14 +73,14 @@ def add_link_joint(spec: mujoco.MjSpec, name: str, *, damping_on_link: bool) -> 
     The rotor's inertia, friction and servo stay on the motor side.
     """
     joint = spec.joint(name)
-    link = joint.parent.add_joint(name=name + LINK, type=joint.type, axis=joint.axis, pos=joint.pos)
+    link = joint.parent.add_joint(name=name + LINK_SUFFIX, type=joint.type, axis=joint.axis, pos=joint.pos)
     link.damping = [0.0, 0.0, 0.0]
     link.armature = 0.0
     if not damping_on_link:
         return
     damping = np.array(joint.damping)
     joint.damping = [0.0, 0.0, 0.0]
-    tendon = spec.add_tendon(name=name + LINK)
+    tendon = spec.add_tendon(name=name + LINK_SUFFIX)
     tendon.damping = damping
     tendon.wrap_joint(name, 1.0)
-    tendon.wrap_joint(name + LINK, 1.0)
+    tendon.wrap_joint(name + LINK_SUFFIX, 1.0)

@@ -35,6 +35,7 @@ class Effect(Modifier):
     structural : whether it adds joints to the model, which then has to be compiled for its places.
     main : kind whose value says how large the effect is.
     steps : amounts the scan tries, in units of the kind's scale; more than one where the response bends.
+    everywhere : whether it may well be alike at all places, so that the scan asks for that too.
     includes : simpler effects that are special cases of this one.
     held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
     """
@@ -49,6 +50,7 @@ class Effect(Modifier):
     main: ClassVar[int] = 0
     held: ClassVar[tuple[str, ...]] = ()
     steps: ClassVar[tuple[float, ...]] = (2.0,)
+    everywhere: ClassVar[bool] = False
     includes: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
@@ -90,8 +92,9 @@ class Effect(Modifier):
         names = [p.name for p in bare.parameters]
         known = []
         for group in bare.groups:
-            first = group.split(",")[0]
-            for kind in cls.sized(scale_at(scales, first)):
+            members = [scale_at(scales, name) for name in group.split(",")]
+            largest = max(members, key=lambda s: s.torque_peak)
+            for kind in cls.sized(largest):
                 known.append(
                     Parameter(
                         names[len(known)], kind.unit, kind.nominal, kind.lower, kind.upper, kind.scale
@@ -117,4 +120,17 @@ def scale_at(scales: Scales, place: str) -> JointScale:
         velocity_peak=max(s.velocity_peak for s in whole),
         acceleration_rms=max(s.acceleration_rms for s in whole),
         span=max(s.span for s in whole),
+    )
+
+
+def middle_scale(scales: Sequence[JointScale]) -> JointScale:
+    """Median size of several joints."""
+    return JointScale(
+        torque_rms=float(np.median([s.torque_rms for s in scales])),
+        torque_peak=float(np.median([s.torque_peak for s in scales])),
+        velocity_rms=float(np.median([s.velocity_rms for s in scales])),
+        velocity_peak=float(np.median([s.velocity_peak for s in scales])),
+        acceleration_rms=float(np.median([s.acceleration_rms for s in scales])),
+        span=float(np.median([s.span for s in scales])),
+        slide=scales[0].slide,
     )

@@ -20,6 +20,7 @@ class CommandDelay(Effect):
     title: ClassVar[str] = "delay of the command"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.15, 0.004),)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("sensor_delay", "a second sensor that is not delayed (current, effort, IMU)"),
         ("viscous_damping", "motion at several frequencies"),

@@ -19,6 +19,7 @@ class CoulombFriction(Effect):
     title: ClassVar[str] = "dry friction"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.05),)
     steps: ClassVar[tuple[float, ...]] = (1.0, 4.0)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("stribeck_friction", "slow motion below the Stribeck velocity"),
         ("load_friction", "the same motion under different loads"),

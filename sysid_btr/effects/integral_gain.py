@@ -21,6 +21,7 @@ class IntegralGain(Effect):
     title: ClassVar[str] = "integral action of the servo"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("ki", "Nm/(rad s)", 0.0, 0.0, 200.0, 1.0),)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("joint_spring", "long holds"),
         ("payload", "long holds"),

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.effects.backlash import LINK, add_link_joint
+from sysid_btr.effects.backlash import add_link_joint
 from sysid_btr.effects.base import Effect, Probe
-from sysid_btr.models.modifier import Kind, Rig
+from sysid_btr.models.modifier import LINK_SUFFIX, Kind, Rig
 from sysid_btr.models.scales import JointScale
 
 if TYPE_CHECKING:
@@ -48,11 +48,11 @@ class JointCompliance(Effect):
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         for name in self.places:
             add_link_joint(spec, name, damping_on_link=self.variant == "link")
-            spec.joint(name + LINK).stiffness = [1.0, 0.0, 0.0]
-            spec.joint(name + LINK).damping = [1.0, 0.0, 0.0]
+            spec.joint(name + LINK_SUFFIX).stiffness = [1.0, 0.0, 0.0]
+            spec.joint(name + LINK_SUFFIX).damping = [1.0, 0.0, 0.0]
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = np.array([rig.model.joint(name + LINK).id for name in self.places])
+        ids = np.array([rig.model.joint(name + LINK_SUFFIX).id for name in self.places])
         dofs = rig.model.jnt_dofadr[ids]
         mobility = rig.model.dof_invweight0[dofs]
         # the stiffest spring that the step resolves: (omega h)^2 < 0.5

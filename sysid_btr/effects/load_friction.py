@@ -21,6 +21,7 @@ class LoadFriction(Effect):
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("ratio", "1", 0.0, 0.0, 0.9, 0.08),)
     steps: ClassVar[tuple[float, ...]] = (1.0, 4.0)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("coulomb_friction", "the same motion under different loads"),
     )

@@ -68,8 +68,8 @@ class Payload(Effect):
             tensor = tensor + _point(own, centre - joint) + _point(added, where - joint)
             principal, axes = np.linalg.eigh(tensor)
             axes[np.linalg.det(axes) < 0, :, 0] *= -1
-            mass[:, body] = total
-            ipos[:, body] = joint
+            mass[loaded, body] = total[loaded]
+            ipos[loaded, body] = joint[loaded]
             inertia[loaded, body] = principal[loaded]
             iquat[loaded, body] = _quaternions(axes[loaded])
 

@@ -18,6 +18,7 @@ class QuadraticDamping(Effect):
     name: ClassVar[str] = "quadratic_damping"
     title: ClassVar[str] = "quadratic damping"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s2/rad2", 0.0, 0.0, 10.0, 0.05),)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("viscous_damping", "motion at several speeds"),
         ("speed_torque_limit", "fast motion under low load"),

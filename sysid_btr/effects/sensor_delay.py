@@ -22,6 +22,7 @@ class SensorDelay(Effect):
     title: ClassVar[str] = "delay of the sensor"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.15, 0.004),)
     needs: ClassVar[str] = "position and a sensor that is not delayed (effort)"
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("command_delay", "a second sensor that is not delayed (current, effort, IMU)"),
     )

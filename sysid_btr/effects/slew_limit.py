@@ -22,6 +22,7 @@ class SlewLimit(Effect):
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("rate", "rad/s", 1000.0, 0.05, 1000.0, 0.2),)
     held: ClassVar[tuple[str, ...]] = ("rate",)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("torque_limit", "slow motion under a large load"),
         ("speed_torque_limit", "slow motion under a large load"),

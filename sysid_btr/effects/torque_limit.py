@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.effects.base import Effect, Probe
-from sysid_btr.models.fields import write_force_limit
+from sysid_btr.models.fields import narrow_force_limit
 from sysid_btr.models.modifier import Kind, Rig
 from sysid_btr.models.scales import JointScale
 
@@ -39,4 +39,4 @@ class TorqueLimit(Effect):
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         most = np.array([p.upper for p in self.spread_parameters(0)])
-        write_force_limit(rig, self.places, np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0]))
+        narrow_force_limit(rig, self.places, np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0]))

@@ -18,6 +18,7 @@ class ViscousDamping(Effect):
     name: ClassVar[str] = "viscous_damping"
     title: ClassVar[str] = "viscous damping"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", 0.0, 0.0, 10.0, 0.05),)
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("kv", "a logged effort or current; position alone cannot tell the two apart"),
         ("quadratic_damping", "motion at several speeds"),

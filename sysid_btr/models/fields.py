@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.models.modifier import Kind, Modifier, Rig
+from sysid_btr.models.modifier import LINK_SUFFIX, Kind, Modifier, Rig
 
 if TYPE_CHECKING:
     import mujoco
@@ -25,6 +25,7 @@ class FieldModifier(Modifier):
 
     scope: ClassVar[Scope] = "joint"
 
+
 def _bodies(rig: Rig, places: tuple[str, ...]) -> list[int]:
     return [rig.model.body(name).id for name in places]
 
@@ -32,6 +33,15 @@ def _bodies(rig: Rig, places: tuple[str, ...]) -> list[int]:
 def _dofs(rig: Rig, places: tuple[str, ...]) -> IntArray:
     result: IntArray = rig.index.dof[rig.index.of(places)]
     return result
+
+
+def _damper(rig: Rig, name: str) -> tuple[Literal["dof", "tendon"], int]:
+    """Where a joint's own damping sits: on both of its sides together, where an effect has split it."""
+    model = rig.model
+    for t in range(model.ntendon):
+        if model.tendon(t).name == name + LINK_SUFFIX:
+            return "tendon", t
+    return "dof", int(model.jnt_dofadr[model.joint(name).id])
 
 
 def _servos(rig: Rig, places: tuple[str, ...]) -> IntArray:
@@ -111,7 +121,9 @@ class Damping(FieldModifier):
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", np.nan, 0.0, np.inf, np.nan),)
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_damping")[:, _dofs(rig, self.places)] = values[:, :, 0]
+        for place, name in enumerate(self.places):
+            kind, where = _damper(rig, name)
+            rig.array(f"{kind}_damping")[:, where] = values[:, place, 0]
 
 
 @dataclass(frozen=True)
@@ -122,7 +134,9 @@ class QuadraticDamping(FieldModifier):
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s2/rad2", np.nan, 0.0, np.inf, np.nan),)
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_dampingpoly")[:, _dofs(rig, self.places), 0] = values[:, :, 0]
+        for place, name in enumerate(self.places):
+            kind, where = _damper(rig, name)
+            rig.array(f"{kind}_dampingpoly")[:, where, 0] = values[:, place, 0]
 
 
 @dataclass(frozen=True)
@@ -161,18 +175,22 @@ class Stiffness(FieldModifier):
 
 @dataclass(frozen=True)
 class ForceLimit(FieldModifier):
-    """Largest torque of a servo, both signs."""
+    """Largest torque of a servo, both signs; in place of the model's own limit."""
 
     name: ClassVar[str] = "force_limit"
     scope: ClassVar[Scope] = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", np.nan, 0.0, np.inf, np.nan),)
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        write_force_limit(rig, self.places, values[:, :, 0])
+        ids = _servos(rig, self.places)
+        bound = values[:, :, 0] / np.abs(rig.model.actuator_gear[ids, 0])
+        rig.array("actuator_forcelimited")[:, ids] = True
+        ranges = rig.array("actuator_forcerange")
+        ranges[:, ids, 0], ranges[:, ids, 1] = -bound, bound
 
 
-def write_force_limit(rig: Rig, places: tuple[str, ...], limit: FloatArray) -> None:
-    """Clip servo torques to +-limit, (m, places); an infinite limit leaves the servo as it was."""
+def narrow_force_limit(rig: Rig, places: tuple[str, ...], limit: FloatArray) -> None:
+    """Clip servo torques to +-limit too, (m, places); an infinite limit leaves the servo as it was."""
     ids = _servos(rig, places)
     limited, ranges = rig.array("actuator_forcelimited"), rig.array("actuator_forcerange")
     finite = np.isfinite(limit)
@@ -244,7 +262,8 @@ class FootFriction(FieldModifier):
         for place, body in enumerate(bodies):
             friction[:, rig.model.geom_bodyid == body, 0] = values[:, place, :1]
         # MuJoCo takes the larger of two geoms' frictions, so the ground must not be the larger one
-        friction[:, rig.model.geom_bodyid == 0, 0] = values[:, :, 0].min(axis=1)[:, None]
+        ground = rig.model.geom_bodyid == 0
+        friction[:, ground, 0] = np.minimum(friction[:, ground, 0], values[:, :, 0].min(axis=1)[:, None])
 
 
 @dataclass(frozen=True)
@@ -304,12 +323,13 @@ def nominal_value(field: str, model: mujoco.MjModel, name: str) -> float:
     if field in joint:
         return float(joint[field](model.joint(name).id))
     if field == "foot_friction":
-        geoms = np.flatnonzero(model.geom_bodyid == model.body(name).id)
-        return float(model.geom_friction[geoms, 0].max()) if len(geoms) else 1.0
+        # of a contact between the body and the ground, where the larger of the two counts
+        geoms = np.isin(model.geom_bodyid, (0, model.body(name).id))
+        return float(model.geom_friction[geoms, 0].max()) if geoms.any() else 1.0
     if field == "force_limit":
         joint_id = model.joint(name).id
         for a in range(model.nu):
             if model.actuator_trnid[a, 0] == joint_id and model.actuator_forcelimited[a]:
-                return float(model.actuator_forcerange[a, 1])
+                return float(model.actuator_forcerange[a, 1] * abs(model.actuator_gear[a, 0]))
         return float("inf")
     return 0.0

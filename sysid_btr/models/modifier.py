@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from mujoco.batch import Batch
 
 
+LINK_SUFFIX = "__link"
+"""Name ending of what play or compliance adds on the link side of a joint: a second joint, a tendon."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One number that a candidate carries.

@@ -16,7 +16,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import ModelError
-from sysid_btr.models.modifier import Index, Modifier, Outputs, Parameter, Rig, Step
+from sysid_btr.models.modifier import LINK_SUFFIX, Index, Modifier, Outputs, Parameter, Rig, Step
 from sysid_btr.models.robot import Robot
 from sysid_btr.replay.grid import Grid, at_samples, make_grid, mean_over_steps
 from sysid_btr.replay.quiet import quiet
@@ -34,8 +34,6 @@ SEGMENT = 1024
 """Steps per rollout call; bounds the records that are held at once."""
 LIFT = 1.0
 """m, by which a robot that is held is lifted from where its model stands."""
-LINK_SUFFIX = "__link"
-"""Name ending of the second joint that play or compliance adds on the link side."""
 
 
 @dataclass(frozen=True)
@@ -307,7 +305,7 @@ class _Drive:
         self.base_bias = self.biasprm[:, self.actuators].copy()
         self.base_friction = self.frictionloss[:, index.dof].copy()
         limited = self.forcelimited[:, self.actuators].astype(bool)
-        base = self.forcerange[:, self.actuators].copy()
+        base = np.sort(self.gear[..., None] * self.forcerange[:, self.actuators], axis=-1)
         self.base_low = np.where(limited, base[..., 0], -np.inf)
         self.base_high = np.where(limited, base[..., 1], np.inf)
         shape = (rig.size, len(index.joints))
@@ -357,11 +355,11 @@ class _Drive:
         self.biasprm[:, self.actuators] = self.base_bias * gain
         self.biasprm[:, self.actuators, 0] += step.motor_torque[:, d] / self.gear
         self.frictionloss[:, self.rig.index.dof] = np.maximum(self.base_friction + step.friction, 0.0)
-        low, high = step.limit_low[:, d], step.limit_high[:, d]
-        finite = np.isfinite(low) | np.isfinite(high)
+        # limits are torques at the joint, MuJoCo's are forces before the gear
+        force = np.sort(np.stack([step.limit_low[:, d], step.limit_high[:, d]], -1) / self.gear[..., None], -1)
+        finite = np.isfinite(force).any(axis=-1)
         self.forcelimited[:, self.actuators] = finite
-        self.forcerange[:, self.actuators, 0] = np.where(finite, low, 0.0)
-        self.forcerange[:, self.actuators, 1] = np.where(finite, high, 0.0)
+        self.forcerange[:, self.actuators] = np.where(finite[..., None], force, 0.0)
 
 
 def servo_torque(rig: Rig, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:

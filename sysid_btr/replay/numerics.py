@@ -15,6 +15,8 @@ from sysid_btr.replay.engine import Numerics, Replay
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
 
+PAPER_TIMING = Numerics("Euler", 0.055 / 7)
+"""Timing of the Back-to-Reality paper: seven steps between references that come every 55 ms."""
 COARSEST = 0.010
 FINEST = 0.00025
 TOLERATED = 0.02
