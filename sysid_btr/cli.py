@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from sysid_btr import __version__
 from sysid_btr.errors import InterruptedRun, LogError, SysidError, UsageError
-from sysid_btr.session import Folder, Interrupted, ProgressLine, interruptible, open_folder, write_all
+from sysid_btr.request import (
+    Keeper,
+    Request,
+    assignments,
+    declared,
+    find_robot,
+    read_logs,
+    remark,
+    replay_targets,
+    split_names,
+    start_values,
+    what_can_be_freed,
+)
+from sysid_btr.session import Folder, Interrupted, ProgressLine, interruptible, write_all
 
 if TYPE_CHECKING:
-    from sysid_btr._typing import FloatArray
     from sysid_btr.diagnosis.closing import Closing
-    from sysid_btr.estimators.journal import Journal
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
-    from sysid_btr.io.log import Log
-    from sysid_btr.models.modifier import Parameter
-    from sysid_btr.models.robot import Robot
 
     Job = Callable[[Study, ProgressLine], Fit | Closing]
 
@@ -387,14 +393,14 @@ def close(
         robot,
         read_logs(log),
         holdout,
-        declared,
+        parameters,
         channels,
         threads,
         seed,
         {"effects": names, "bounds": bounds or []},
     )
     keeper = Keeper.open(out, resume, overwrite, request)
-    _finish(request, keeper, _closing_job(declared, names, seed, keeper), as_json)
+    _finish(request, keeper, _closing_job(parameters, names, seed, keeper), as_json)
 
 
 @app.command()
@@ -440,13 +446,13 @@ def demo(
 # --- what the verbs share --------------------------------------------------------------------------------
 
 
-def _closing_job(declared: list[str], effects: list[str], seed: int, keeper: Keeper) -> Job:
+def _closing_job(parameters: list[str], effects: list[str], seed: int, keeper: Keeper) -> Job:
     def job(study: Study, progress: ProgressLine) -> Closing:
         from sysid_btr.diagnosis.close import close as close_loop
 
         return close_loop(
             study,
-            declared,
+            parameters,
             effects=tuple(effects),
             rng=_generator(seed),
             journal=keeper.journal,

@@ -50,7 +50,7 @@ class StudyFile(BaseModel):
         flags: dict[str, Any] = {
             "log": [_beside(folder, p) for p in _listed(self.log)],
             "holdout": [_beside(folder, p) for p in _listed(self.holdout)],
-            "fit": _listed(self.fit),
+            "free": _listed(self.fit),
             "effects": _listed(self.effects),
             "channels": _listed(self.channels),
             "start": [f"{name}={value!r}" for name, value in (self.start or {}).items()],
@@ -59,8 +59,9 @@ class StudyFile(BaseModel):
             "model": None if self.model is None else _beside(folder, self.model),
             **{
                 name: getattr(self, name)
-                for name in ("estimator", "max_evaluations", "seed", "threads", "out", "json_")
+                for name in ("estimator", "max_evaluations", "seed", "threads", "out")
             },
+            "as_json": self.json_,
             "resume": self.resume,
             "overwrite": self.overwrite,
         }

@@ -105,6 +105,7 @@ class Keeper:
 
 
 def find_robot(name: str | None, bounds: list[str] | None) -> Robot:
+    """The robot called for, with the bounds given to its parameters."""
     from dataclasses import replace
 
     from sysid_btr.models.builtin import BUILTIN
@@ -156,6 +157,7 @@ def _holdout(given: list[str] | None) -> float | list[Log]:
 
 
 def chosen_channels(given: list[str] | None) -> tuple[str, ...]:
+    """Channels to fit; none if nothing is said."""
     from sysid_btr.objectives.targets import COMPARED
 
     names = split_names(given)
@@ -179,6 +181,7 @@ def declared(robot: Robot, free: list[str] | None) -> list[str]:
 
 
 def what_can_be_freed(robot: Robot) -> str:
+    """Every field of the grammar with the names it can be freed at, for those who gave none."""
     from sysid_btr.models.fields import FIELDS
     from sysid_btr.models.robot import body_names, joint_names, servo_joints
 
@@ -232,6 +235,7 @@ def start_values(parameters: Sequence[Parameter], given: list[str] | None) -> Fl
 
 
 def assignments(flag: str, given: list[str] | None) -> list[tuple[str, float]]:
+    """``NAME=NUMBER`` texts of a flag as pairs."""
     pairs, problems = [], []
     for text in given or ():
         name, equals, right = text.rpartition("=")
@@ -246,6 +250,7 @@ def assignments(flag: str, given: list[str] | None) -> list[tuple[str, float]]:
 
 
 def bounds_table(given: list[str] | None) -> list[tuple[str, tuple[float, float]]]:
+    """``NAME=LOW:HIGH`` texts as pairs."""
     pairs, problems = [], []
     for text in given or ():
         name, _, right = text.rpartition("=")
@@ -261,6 +266,7 @@ def bounds_table(given: list[str] | None) -> list[tuple[str, tuple[float, float]
 
 
 def number(text: str) -> float | None:
+    """A finite number, or None."""
     try:
         value = float(text)
     except ValueError:
@@ -269,6 +275,7 @@ def number(text: str) -> float | None:
 
 
 def split_names(given: list[str] | None) -> list[str]:
+    """Names of a repeatable flag that may also hold several, with commas."""
     return [name for text in given or () for name in text.split(",") if name]
 
 

@@ -10,7 +10,7 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,10 +130,8 @@ def replay_result(
     position = scores.get("position")
     message = "the replay diverged"
     if position is not None and math.isfinite(position.rmse):
-        message = (
-            f"position error {si(position.rmse, unit['position'].partition(',')[0])}, "
-            f"where the sensor's own noise is {si(position.floor, unit['position'].partition(',')[0])}."
-        )
+        error, floor = si_all([position.rmse, position.floor], unit["position"].partition(",")[0])
+        message = f"position error {error}, where the sensor's own noise is {floor}."
     plain: dict[str, Any] = clean(
         {
             "schema": SCHEMA,
@@ -189,14 +187,15 @@ def _floors(scores: Scores) -> dict[str, float]:
 
 def fit_message(fit: Fit) -> str:
     """The outcome of a fit in one sentence."""
-    unit = channel_units(fit.study).get("position", "rad")
+    unit = channel_units(fit.study)["position"].partition(",")[0]
     told = sum(e.identifiable != "no" for e in fit.estimates)
     parts = [f"{told} of {len(fit.estimates)} parameters can be told from this log"]
     if "position" in fit.before.holdout:
         nominal, before = fit.nominal.holdout["position"], fit.before.holdout["position"]
+        first, last, floor = si_all([nominal.rmse, before.rmse, before.floor], unit)
         parts.append(
-            f"the held-out position error goes from {si(nominal.rmse, unit)} to {si(before.rmse, unit)}, "
-            f"where the sensor's own noise is {si(before.floor, unit)}"
+            f"the held-out position error goes from {first} to {last}, "
+            f"where the sensor's own noise is {floor}"
         )
     if not fit.result.converged:
         parts.append("the fit did not converge")
@@ -270,9 +269,11 @@ def clean(value: Any) -> Any:
         return int(value)
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
+    if is_dataclass(value) and not isinstance(value, type):
+        return clean(asdict(value))
     if value is None or isinstance(value, str):
         return value
-    return str(value)
+    raise TypeError(f"{type(value).__name__} has no place in a result: {value!r}")
 
 
 def to_json(result: Mapping[str, Any]) -> str:
@@ -319,9 +320,34 @@ def si(value: float | None, unit: str, digits: int = 3) -> str:
         return f"{value:.{digits}g}"
     if unit not in PREFIXED or value == 0:
         return f"{value:.{digits}g} {unit}"
-    size = abs(value)
-    factor, prefix = next(((f, p) for f, p in PREFIXES if size >= f * 0.9995), PREFIXES[-1])
+    factor, prefix = _prefix(abs(value))
     return f"{value / factor:.{digits}g} {prefix}{unit}"
+
+
+def _prefix(size: float) -> tuple[float, str]:
+    return next(((f, p) for f, p in PREFIXES if size >= f * 0.9995), PREFIXES[-1])
+
+
+def si_all(values: Sequence[float | None], unit: str, digits: int = 3) -> list[str]:
+    """Numbers that are compared with each other, all with the prefix of the largest."""
+    known = [abs(v) for v in values if v is not None and math.isfinite(v)]
+    if unit not in PREFIXED or not any(known):
+        return [si(v, unit, digits) for v in values]
+    factor, prefix = _prefix(max(known))
+    return [
+        "unknown" if v is None or not math.isfinite(v) else f"{v / factor:.{digits}g} {prefix}{unit}"
+        for v in values
+    ]
+
+
+def with_digits_of(value: float | None, std: float | None) -> str:
+    """A value with as many decimals as two digits of its standard error have."""
+    if value is None:
+        return "-"
+    if std is None or not std > 0:
+        return f"{value:.4g}"
+    decimals = 1 - math.floor(math.log10(std))
+    return f"{value:.{decimals}f}" if 0 <= decimals <= 7 else f"{value:.4g}"
 
 
 def exit_code(result: Mapping[str, Any]) -> int:

@@ -90,7 +90,7 @@ class Effect(Modifier):
         """The effect at some places of a robot whose sizes are known."""
         bare = cls(places=tuple(places), shared=shared and len(places) > 1)
         names = [p.name for p in bare.parameters]
-        known = []
+        known: list[Parameter] = []
         for group in bare.groups:
             members = [scale_at(scales, name) for name in group.split(",")]
             largest = max(members, key=lambda s: s.torque_peak)

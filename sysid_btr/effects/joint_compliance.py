@@ -59,7 +59,8 @@ class JointCompliance(Effect):
         stiffest = 0.5 / (mobility * rig.timestep**2)
         stiffness = 1 / np.maximum(values[:, :, 0], 1 / stiffest)
         rig.array("jnt_stiffness")[:, ids] = stiffness
-        rig.array("dof_damping")[:, dofs] = np.minimum(RELAXATION * stiffness, 0.5 / (mobility * rig.timestep))
+        most = 0.5 / (mobility * rig.timestep)
+        rig.array("dof_damping")[:, dofs] = np.minimum(RELAXATION * stiffness, most)
 
 
 @dataclass(frozen=True)

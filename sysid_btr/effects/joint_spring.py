@@ -31,10 +31,10 @@ class JointSpring(Effect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        k = scale.torque_rms / scale.span
+        k, reach = scale.torque_rms / scale.span, 3 * max(scale.span, 1.0)
         return (
             Kind("stiffness", scale.unit("Nm/rad"), 0.0, 0.0, 30 * k, 0.3 * k),
-            Kind("rest", scale.unit("rad"), 0.0, -3 * max(scale.span, 1.0), 3 * max(scale.span, 1.0), 0.2 * scale.span),
+            Kind("rest", scale.unit("rad"), 0.0, -reach, reach, 0.2 * scale.span),
         )
 
     @classmethod

@@ -91,7 +91,8 @@ def select_effects(names: Sequence[str]) -> tuple[type[Effect], ...]:
     if unknown:
         hints = [difflib.get_close_matches(n, known, n=1) for n in unknown]
         listed = ", ".join(
-            f"{n!r}" + (f" (did you mean {h[0]!r}?)" if h else "") for n, h in zip(unknown, hints, strict=True)
+            f"{n!r}" + (f" (did you mean {h[0]!r}?)" if h else "")
+            for n, h in zip(unknown, hints, strict=True)
         )
         raise UsageError(f"unknown effect {listed}; effects are {', '.join(known)}, or all")
     return tuple(e for e in EFFECTS if e.name in names)

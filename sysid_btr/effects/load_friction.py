@@ -1,4 +1,4 @@
-"""Load-dependent friction: dry friction proportional to the torque that the gear transmits (BAM, arXiv:2410.08650)."""
+"""Load-dependent friction: proportional to the torque that the gear transmits (BAM, arXiv:2410.08650)."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.effects.base import Effect, Probe
 from sysid_btr.models.interpolation import hermite
 from sysid_btr.models.modifier import Kind, Outputs, Rig
@@ -43,7 +43,7 @@ class SensorDelay(Effect):
             f = (early - time[after - 1]) / span
             p, v = outputs.position[:, :, column], outputs.velocity[:, :, column]
 
-            def take(array: FloatArray, at: FloatArray) -> FloatArray:
+            def take(array: FloatArray, at: IntArray) -> FloatArray:
                 return np.take_along_axis(array, at, axis=1)
 
             v0, v1 = take(v, after - 1), take(v, after)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.effects.base import Effect, Probe
-from sysid_btr.models.modifier import Kind, Rig, Step
+from sysid_btr.models.modifier import Kind, Step
 from sysid_btr.models.scales import JointScale
 
 

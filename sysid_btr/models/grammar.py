@@ -140,8 +140,11 @@ def _limits(
     if not math.isfinite(reach):
         reach = 100 * size
     lower = parameter.lower if math.isfinite(parameter.lower) else -reach
-    upper = parameter.upper if math.isfinite(parameter.upper) else max(reach, 10 * nominal)
-    if not math.isfinite(nominal):
+    unlimited = not math.isfinite(nominal)
+    upper = parameter.upper
+    if not math.isfinite(upper):
+        upper = reach if unlimited else max(reach, 10 * nominal)
+    if unlimited:
         nominal = upper
     lower, upper = _own_bounds(parameter.name, field, place, robot.bounds, (lower, upper))
     unit = SLIDE_UNITS.get(parameter.unit, parameter.unit) if _slides(model, place) else parameter.unit

@@ -304,7 +304,8 @@ def _add_sensors(spec: mujoco.MjSpec, parts: tuple[Part, ...], bodies: dict[str,
             )
     torso = next(p for p in parts if not p.parent)
     bodies[torso.name].add_site(name="imu", pos=_world(torso.offset))
-    for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
+    inertial = {"gyro": mujoco.mjtSensor.mjSENS_GYRO, "acc": mujoco.mjtSensor.mjSENS_ACCELEROMETER}
+    for name, kind in inertial.items():
         spec.add_sensor(name=name, type=kind, objtype=site, objname="imu")
     for part in parts:
         if part.name in FEET:

@@ -123,7 +123,9 @@ class Replay:
         """
         candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
         if candidates.shape[1] != len(self.parameters):
-            raise ValueError(f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}")
+            raise ValueError(
+                f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}"
+            )
         for first in range(0, len(candidates), CHUNK):
             rows = slice(first, min(first + CHUNK, len(candidates)))
             with quiet():
@@ -154,7 +156,7 @@ class Replay:
         qvel = np.tile(self.start[1], (m, 1))
         command: FloatArray = np.broadcast_to(self.grid.command, (m, *self.grid.command.shape))
         applied: FloatArray | None = None
-        border_time = np.arange(self.grid.steps + 1) * self.grid.timestep
+        border_time = self.grid.timestep * np.arange(self.grid.steps + 1, dtype=np.float64)
         for modifier, values in pairs:
             modifier.initial_state(rig, values, qpos, qvel)
             command = modifier.shape_command(rig, values, command)
@@ -356,7 +358,8 @@ class _Drive:
         self.biasprm[:, self.actuators, 0] += step.motor_torque[:, d] / self.gear
         self.frictionloss[:, self.rig.index.dof] = np.maximum(self.base_friction + step.friction, 0.0)
         # limits are torques at the joint, MuJoCo's are forces before the gear
-        force = np.sort(np.stack([step.limit_low[:, d], step.limit_high[:, d]], -1) / self.gear[..., None], -1)
+        limits = np.stack([step.limit_low[:, d], step.limit_high[:, d]], axis=-1)
+        force = np.sort(limits / self.gear[..., None], axis=-1)
         finite = np.isfinite(force).any(axis=-1)
         self.forcelimited[:, self.actuators] = finite
         self.forcerange[:, self.actuators] = np.where(finite[..., None], force, 0.0)
@@ -406,7 +409,7 @@ def compile_model(
         for joint in list(spec.joints):
             if joint.type == mujoco.mjtJoint.mjJNT_FREE:
                 # a robot that is held hangs clear of the ground it would otherwise stand on
-                joint.parent.pos = np.array(joint.parent.pos) + [0.0, 0.0, LIFT]
+                joint.parent.pos = np.add(joint.parent.pos, (0.0, 0.0, LIFT))
                 spec.delete(joint)
     # friction as stiff as the step allows: the default creeps and blurs reversals
     constant = max(2 * numerics.timestep, 0.002)

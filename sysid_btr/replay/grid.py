@@ -63,9 +63,10 @@ def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep:
     high = np.where(fraction > 0, low + 1, low)
     state = np.unique(np.concatenate([low, high]))
     steps = max(int(state[-1]), 1)
+    snapped = np.where(aligned, rounded * timestep, time)
     return Grid(
         timestep=timestep,
-        command=_mean_command(log, np.where(aligned, rounded * timestep, time), joints, defaults, timestep, steps),
+        command=_mean_command(log, snapped, joints, defaults, timestep, steps),
         sample_time=time,
         state=state,
         before=np.searchsorted(state, low),

@@ -54,8 +54,8 @@ def choose_numerics(robot: Robot, log: Log, threads: int = 0) -> tuple[Numerics,
         if step / 2 < FINEST:
             raise ModelError(
                 f"model {robot.name}: the replay of {log.path or 'the log'} diverges even with a step of "
-                f"{1e3 * step:g} ms. Check gains, armature and masses of the model: a servo far too stiff for "
-                "its inertia, or a body without mass, is the usual cause."
+                f"{1e3 * step:g} ms. Check gains, armature and masses of the model: a servo far too stiff "
+                "for its inertia, or a body without mass, is the usual cause."
             )
         step, now = step / 2, half
 

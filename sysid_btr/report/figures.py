@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.result import si
+from sysid_btr.result import si_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -187,9 +187,11 @@ def _draw_row(row: Sequence[Axes], item: Trace, theme: Mapping[str, str]) -> Non
         left.plot(x, y, color=colour, lw=0.9)
     left.axhspan(-2 * item.noise * factor, 2 * item.noise * factor, color=theme["faint"], alpha=0.3, lw=0)
     left.set_xlim(low, high)
+    for axis in row:
+        axis.locator_params(nbins=6)
     left.set_ylabel(f"log - model ({unit})")
-    errors = ", ".join(f"{si(item.error(n) * item.noise, item.unit)}" for n in item.predicted)
-    left.set_title(f"held-out rmse {errors}; band: 2 x noise", fontsize=9)
+    errors = ", ".join(si_all([item.error(n) * item.noise for n in item.predicted], item.unit))
+    left.set_title(f"rmse {errors} (band: 2 x noise)", fontsize=8)
 
 
 def _draw_lines(axis: Axes, item: Trace, begin: float, end: float, theme: Mapping[str, str]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.report.text import compact, number, stages, told
-from sysid_btr.result import si
+from sysid_btr.result import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -55,7 +55,7 @@ def _template() -> Template:
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters.update(si=si, number=number, told=told, compact=compact)
+    environment.filters.update(si=si, number=number, told=told, compact=compact, digits=with_digits_of)
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
 
 
@@ -68,11 +68,12 @@ def _error_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     for part, label in (("train", "fitted data"), ("holdout", "held out")):
         for channel in result["nominal"].get(part, {}):
             unit = result["units"].get(channel, "").partition(",")[0]
-            cells = []
-            for key, _ in stages(result):
-                score = result[key][part].get(channel)
-                cells.append(None if score is None else {**score, "text": si(score["rmse"], unit)})
-            floor = si(result["noise_floor"].get(channel), unit)
+            scores = [result[key][part].get(channel) for key, _ in stages(result)]
+            values = [None if s is None else s["rmse"] for s in scores]
+            *errors, floor = si_all([*values, result["noise_floor"].get(channel)], unit)
+            cells = [
+                None if s is None else {**s, "text": text} for s, text in zip(scores, errors, strict=True)
+            ]
             rows.append({"channel": channel, "part": label, "cells": cells, "floor": floor})
     return rows
 
@@ -90,11 +91,15 @@ def _bars(result: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     floor = result["noise_floor"].get("position")
     order = sorted(values, key=lambda j: -max(values[j]))
+    texts = iter(si_all([v for j in order for v in values[j]], unit))
     return {
         "names": [name for _, name in columns],
         "floor": None if floor is None else min(100 * floor / largest, 100),
         "joints": [
-            {"name": j, "bars": [{"width": 100 * v / largest, "text": si(v, unit)} for v in values[j]]}
+            {
+                "name": j,
+                "bars": [{"width": 100 * v / largest, "text": next(texts)} for v in values[j]],
+            }
             for j in order
         ],
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
-from sysid_btr.result import si
+from sysid_btr.result import si_all, with_digits_of
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -86,18 +86,17 @@ def errors_table(result: Mapping[str, Any]) -> Table:
     for part, label in (("train", "fitted data"), ("holdout", "held out")):
         for channel in result["nominal"].get(part, {}):
             unit = result["units"].get(channel, "").partition(",")[0]
-            cells = [error_cell(result[key][part].get(channel), unit) for key, _ in columns]
-            label_here = channel if result["kind"] == "replay" else f"{channel}, {label}"
-            table.add_row(label_here, *cells, si(result["noise_floor"].get(channel), unit))
+            scores = [result[key][part].get(channel, {}) for key, _ in columns]
+            floor = result["noise_floor"].get(channel)
+            *errors, least = si_all([*(s.get("rmse") for s in scores), floor], unit)
+            cells = [text + relative(s.get("nrmse")) for text, s in zip(errors, scores, strict=True)]
+            table.add_row(channel if result["kind"] == "replay" else f"{channel}, {label}", *cells, least)
     return table
 
 
-def error_cell(score: Mapping[str, Any] | None, unit: str) -> str:
-    """Absolute and relative error of one channel."""
-    if score is None:
-        return ""
-    relative = score["nrmse"]
-    return si(score["rmse"], unit) + ("" if relative is None else f"  ({100 * relative:.3g} %)")
+def relative(nrmse: float | None) -> str:
+    """Error relative to the signal, in brackets."""
+    return "" if nrmse is None else f"  ({100 * nrmse:.3g} %)"
 
 
 def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
@@ -111,9 +110,9 @@ def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
         table.add_row(
             p["name"],
             number(p["nominal"]),
-            number(p["value"]) if known else "-",
+            with_digits_of(p["value"], p["std"]) if known else "-",
             number(p["std"], 2) if known else "-",
-            f"{number(p['ci95'][0])} .. {number(p['ci95'][1])}" if known else "-",
+            " .. ".join(with_digits_of(end, p["std"]) for end in p["ci95"]) if known else "-",
             "x nominal" if p["unit"] == "1" else p["unit"],
             told(p),
         )
@@ -146,8 +145,9 @@ def joints_table(joints: Mapping[str, float], unit: str) -> Table:
     """Error of each joint, worst first."""
     table = _table("joint")
     table.add_column("position error (rmse)", justify="right")
-    for name, value in sorted(joints.items(), key=lambda item: -(item[1] or float("inf"))):
-        table.add_row(name, si(value, unit))
+    order = sorted(joints, key=lambda name: -joints[name])
+    for name, text in zip(order, si_all([joints[name] for name in order], unit), strict=True):
+        table.add_row(name, text)
     return table
 
 

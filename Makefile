@@ -1,0 +1,48 @@
+# `make demo` and `make test` do all the set-up; a second run starts at once.
+
+VENV := .venv
+BIN := $(VENV)/bin
+# the first interpreter that is new enough
+FIND_PYTHON = for p in $(PYTHON) python3 python3.13 python3.12 python3.11 python; do \
+  command -v $$p >/dev/null 2>&1 \
+  && $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 \
+  && echo $$p && exit 0; done; \
+  echo "no Python 3.11 or newer with venv: install one, or say make PYTHON=/path/to/python3" >&2; exit 1
+PYTEST_FLAGS ?= -n 2 -q
+SOURCES := sysid_btr tests benchmarks sample_logs
+
+.PHONY: demo test lint types check dev format clean
+
+demo: $(VENV)/installed
+	$(BIN)/sysid-btr demo
+
+test: dev lint types check
+
+dev: $(VENV)/installed-dev
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check $(SOURCES)
+
+types: $(VENV)/installed-dev
+	$(BIN)/mypy
+
+check: $(VENV)/installed-dev
+	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+
+format: $(VENV)/installed-dev
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+clean:
+	rm -rf $(VENV) demo_out dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+$(VENV)/bin/python:
+	python=$$($(FIND_PYTHON)) && $$python -m venv $(VENV)
+
+$(VENV)/installed: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/installed-dev: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $(VENV)/installed $@

@@ -1,0 +1,258 @@
+"""result.json: strict JSON, every promised key, and the same numbers when read back."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord
+from sysid_btr.errors import UsageError
+from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.scores import ChannelScore, Scores
+from sysid_btr.identify.study import Study, make_study
+from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.robot import load_robot
+from sysid_btr.replay.engine import Numerics
+from sysid_btr.report.html import render
+from sysid_btr.report.text import console, show
+from sysid_btr.result import clean, exit_code, make_result, read_result, si, si_all, to_json, with_digits_of
+
+PROMISED = {
+    "schema",
+    "kind",
+    "verdict",
+    "noise_floor",
+    "nominal",
+    "before",
+    "after",
+    "parameters",
+    "effects",
+    "candidates",
+    "steps",
+    "signature",
+    "seed",
+    "versions",
+    "replays",
+    "wall_s",
+    "logs",
+    "model",
+}
+ARM = """
+<mujoco>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0" armature="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><position name="hinge" joint="hinge" kp="8" kv="0.4"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    (tmp_path / "arm.xml").write_text(ARM)
+    time = np.arange(200) * 0.01
+    motion = 0.3 * np.sin(3 * time)
+    channels = {"command.hinge": motion, "position.hinge": motion}
+    log = Log(time, channels, LogMeta(), np.zeros(200, dtype=np.int64))
+    robot = load_robot(str(tmp_path / "arm.xml"))
+    return make_study(robot, [log], numerics=Numerics("RK4", 0.005), threads=1)
+
+
+def estimate(name: str, identifiable: str = "yes", reason: str = "") -> Estimate:
+    return Estimate(
+        name=name,
+        unit="Nm",
+        nominal=0.0,
+        value=0.3,
+        std=0.01,
+        ci95=(0.28, 0.32),
+        bounds=(0.0, math.inf),
+        identifiable=identifiable,  # type: ignore[arg-type]
+        at_bound=False,
+        reason=reason,
+    )
+
+
+def scores(rmse: float) -> Scores:
+    channel = ChannelScore(rmse, rmse / 0.2, np.float64((rmse / 6e-4) ** 2), {"hinge": rmse}, 6e-4)
+    return Scores({"position": channel}, {"position": channel})
+
+
+def closing(study: Study, **changes: object) -> Closing:
+    effect = NamedEffect(
+        effect="coulomb_friction",
+        variant="",
+        where=("hinge",),
+        parameters=(estimate("coulomb_friction:hinge"),),
+        gain_holdout=0.97,
+        confused_with=("stribeck_friction",),
+        sentence="dry friction at <hinge>",
+    )
+    content: dict[str, object] = {
+        "study": study,
+        "verdict": "explained",
+        "message": "dry friction",
+        "noise_floor": {"position": 6e-4},
+        "nominal": scores(0.01),
+        "before": scores(0.004),
+        "after": scores(6.1e-4),
+        "parameters": (estimate("mass:arm", "no", "hardly any sensor responds"),),
+        "effects": (effect,),
+        "candidates": (Candidate("coulomb_friction", ("hinge",), 0.9, math.nan, ()),),
+        "steps": (StepRecord((), (), 44.0, 45.0), StepRecord(("coulomb_friction at hinge",), (), 1.0, 1.1)),
+        "signature": {"period": np.float64(1.7), "joints": ["hinge"]},
+        "before_modifiers": (),
+        "before_values": np.zeros(0),
+        "modifiers": (),
+        "values": np.zeros(0),
+        "replays": 12,
+        "seconds": 1.5,
+    }
+    return Closing(**{**content, **changes})  # type: ignore[arg-type]
+
+
+def test_every_promised_key_is_there(study: Study) -> None:
+    result = make_result(closing(study), seed=4)
+    assert set(result) >= PROMISED
+    for stage in ("nominal", "before", "after"):
+        for part in ("train", "holdout"):
+            assert set(result[stage][part]["position"]) >= {"rmse", "nrmse", "chi2"}
+    [parameter] = result["parameters"]
+    assert {"name", "unit", "nominal", "value", "std", "ci95", "bounds"} <= set(parameter)
+    assert {"identifiable", "at_bound", "reason"} <= set(parameter)
+    [effect] = result["effects"]
+    assert {"effect", "where", "parameters", "gain_holdout"} <= set(effect)
+    assert set(effect["parameters"][0]) == set(parameter)
+
+
+def test_round_trip(study: Study, tmp_path: Path) -> None:
+    result = make_result(closing(study), seed=4, wall_s=2.5)
+    file = tmp_path / "result.json"
+    file.write_text(to_json(result))
+    assert read_result(file) == result
+    assert read_result(tmp_path) == result
+
+
+def test_what_is_not_finite_is_null(study: Study) -> None:
+    text = to_json(make_result(closing(study)))
+    result = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in result.json"))
+    assert result["parameters"][0]["bounds"] == [0.0, None]
+    assert result["candidates"][0]["amplitude"] is None
+
+
+NESTED = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+@given(NESTED)
+def test_clean_gives_strict_json_and_is_idempotent(value: object) -> None:
+    once = clean(value)
+    assert json.loads(json.dumps(once, allow_nan=False)) == once
+    assert clean(once) == once
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False)))
+def test_finite_numbers_survive_bit_for_bit(values: list[float]) -> None:
+    assert json.loads(to_json({"x": np.array(values)}))["x"] == values
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[1]", '{"schema": "sysid_btr.result/2"}', "{}"],
+    ids=["empty", "cut", "list", "2", "none"],
+)
+def test_what_is_no_result_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "result.json").write_text(text)
+    with pytest.raises(UsageError, match=r"result\.json"):
+        read_result(tmp_path)
+
+
+def test_exit_code_tells_a_finding_from_a_failure(study: Study) -> None:
+    result = make_result(closing(study))
+    assert exit_code(result) == 0
+    assert exit_code({**result, "effects": []}) == 5
+    assert exit_code({**result, "effects": [], "parameters": []}) == 0
+    assert exit_code({**result, "converged": False}) == 5
+    told = {**result["parameters"][0], "identifiable": "weak"}
+    assert exit_code({**result, "effects": [], "parameters": [*result["parameters"], told]}) == 0
+
+
+@pytest.mark.parametrize("verdict", ["explained", "nothing_missing", "ambiguous", "unexplained"])
+def test_the_report_holds_every_finding_and_escapes_names(study: Study, verdict: str) -> None:
+    result = make_result(closing(study, verdict=verdict, message="a <b>bold</b> claim"))
+    page = render(result, b"light", b"dark")
+    for text in ("mass:arm", "hardly any sensor responds", "coulomb_friction", "stribeck_friction"):
+        assert text in page
+    assert "<b>" not in page
+    assert "dry friction at &lt;hinge&gt;" in page
+    assert "prefers-color-scheme: dark" in page
+    for outside in ("http:", "https:", 'src="/', "@import"):
+        assert outside not in page
+
+
+def test_tables_name_effect_interval_and_reason(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+    import sys
+
+    show(make_result(closing(study, verdict="ambiguous")), console(sys.stdout))
+    text = capsys.readouterr().out
+    for part in (
+        "dry friction at <hinge>",
+        "not identifiable",
+        "hardly any sensor",
+        "0.280 .. 0.320",
+        "mrad",
+    ):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.000612, "rad", "0.612 mrad"),
+        (0.0123, "rad", "12.3 mrad"),
+        (2.15e-6, "m", "2.15 µm"),
+        (0.0, "rad", "0 rad"),
+        (1.2, "1", "1.2"),
+        (95.1, "kg", "95.1 kg"),
+        (None, "rad", "unknown"),
+        (math.nan, "rad", "unknown"),
+    ],
+)
+def test_numbers_for_people(value: float | None, unit: str, text: str) -> None:
+    assert si(value, unit) in (text, text.replace("0.612 m", "612 µ"))
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (0.99987, 0.00017, "0.99987"),
+        (1.267, 0.014, "1.267"),
+        (200.31, 6.7, "200.3"),
+        (95108.9, 230.0, "9.511e+04"),
+        (1.0, 0.0, "1"),
+        (None, 0.1, "-"),
+    ],
+)
+def test_a_value_shows_the_digits_it_has(value: float | None, std: float, text: str) -> None:
+    assert with_digits_of(value, std) == text
+
+
+def test_compared_numbers_share_a_prefix() -> None:
+    assert si_all([2.29e-3, 5.96e-4, None], "rad") == ["2.29 mrad", "0.596 mrad", "unknown"]
+
+
+def test_what_json_cannot_hold_is_an_error() -> None:
+    with pytest.raises(TypeError, match="object"):
+        clean({"x": object()})
