@@ -66,6 +66,9 @@ def run(argv: Sequence[str]) -> int:
     except Interrupted:
         remark("interrupted")
         return InterruptedRun.exit_code
+    except InterruptedRun as stop:
+        remark(str(stop))
+        return stop.exit_code
     except SysidError as error:
         remark(f"error: {error}")
         return error.exit_code
@@ -380,7 +383,7 @@ def close(
     Shows the held-out error before and after.
 
     Without --fit all masses and the common servo gains are freed, so that a wrong mass does not pass for an
-    effect; --fit none trusts the model as it is.
+    effect.
     """
     from sysid_btr.effects.library import select_effects
 
@@ -495,7 +498,7 @@ def _interrupted(keeper: Keeper, progress: ProgressLine) -> str:
     if keeper.folder is None:
         return "interrupted; nothing is kept without --out"
     return (
-        f"interrupted at loss {progress.best:.4g}; {len(keeper.journal)} evaluations are kept in "
+        f"interrupted at loss {progress.best:.4g}; {keeper.journal.evaluations} replays are kept in "
         f"{keeper.folder.journal}: the same command with --resume goes on from there"
     )
 

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
 """What `close` frees where nothing is said: a wrong mass or gain must not pass for an effect."""
-NOTHING = "none"
 HOLDOUT = 0.3
 
 
@@ -171,12 +170,10 @@ def declared(robot: Robot, free: list[str] | None) -> list[str]:
     """What `close` frees."""
     from sysid_btr.models.robot import servo_joints
 
-    if free == [NOTHING]:
-        return []
     if free:
         return free
     declared = [p for p in DECLARED if p.startswith("mass") or servo_joints(robot)]
-    remark(f"freeing {', '.join(declared)} (--fit says otherwise, --fit none nothing)")
+    remark(f"freeing {', '.join(declared)} (--fit says otherwise)")
     return declared
 
 

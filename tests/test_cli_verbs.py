@@ -17,6 +17,7 @@ import typer
 
 from sysid_btr.cli import app, run
 from sysid_btr.config import StudyFile
+from sysid_btr.demo import cases
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.models.robot import load_robot
@@ -24,7 +25,7 @@ from sysid_btr.replay.engine import Numerics
 from sysid_btr.replay.log import replay_log
 from sysid_btr.result import read_result
 
-MASS, KP = 1.2, 0.9
+MASS, KP, FRICTION = 1.2, 0.9, 0.1
 PENDULUM = """
 <mujoco model="pendulum">
   <compiler angle="radian"/>
@@ -68,7 +69,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "arm.xml").write_text(PENDULUM)
     (folder / "other.xml").write_text(PENDULUM.replace('"hinge"', '"wheel"'))
     (folder / "broken.xml").write_text("<mujoco><worldbody>")
-    n, period = 400, 0.01
+    n, period = 1200, 0.01
     time_ = np.arange(n) * period
     command = 0.6 * np.sin(2.0 * time_) + 0.4 * np.sin(5.3 * time_ + 1) - 0.4 * np.sin(1.0)
     meta = LogMeta(robot="arm", sample_period=period, source="test")
@@ -79,7 +80,15 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"mass:arm": MASS, "kp:hinge": KP},
         numerics=Numerics("RK4", 0.0025),
     )
+    sticky = replay_log(
+        load_robot(str(folder / "arm.xml")),
+        told,
+        {"kp:hinge": KP, "frictionloss:hinge": FRICTION},
+        numerics=Numerics("RK4", 0.0025),
+    )
     rng = np.random.default_rng(7)
+    stuck = sticky.channels["position.hinge"] + rng.normal(scale=5e-4, size=n)
+    write_log(replace(told, channels={**told.channels, "position.hinge": stuck}), folder / "sticky.parquet")
     position = truth.channels["position.hinge"] + rng.normal(scale=5e-4, size=n)
     log = replace(told, channels={**told.channels, "position.hinge": position})
     write_log(log, folder / "arm.parquet")
@@ -343,6 +352,44 @@ def test_study_file_mistakes(cli: Cli, tmp_path: Path, text: str, said: str) -> 
     assert said in answer.err
 
 
+def test_close_names_the_effect_and_resumes(cli: Cli, bench: Path, tmp_path: Path) -> None:
+    out = tmp_path / "o"
+    asked = ("--model", bench / "arm.xml", "--log", bench / "sticky.parquet", "--fit", "kp:*", "--threads", 1)
+    asked = (*asked, "--effects", "coulomb_friction,viscous_damping", "--effects", "command_delay")
+    answer = cli("close", *asked, "--out", out)
+    assert answer.code == 0, answer.err
+    result = read_result(out)
+    assert result["verdict"] == "explained"
+    [effect] = result["effects"]
+    assert (effect["effect"], effect["where"]) == ("coulomb_friction", ["hinge"])
+    [size] = effect["parameters"]
+    assert size["value"] == pytest.approx(FRICTION, rel=0.15)
+    assert effect["sentence"] in answer.out.replace("\n", " ")
+    errors = [result[stage]["holdout"]["position"]["rmse"] for stage in ("nominal", "before", "after")]
+    assert errors[2] < 0.2 * min(errors[:2])
+    again = cli("close", *asked, "--out", out, "--resume", "--json")
+    assert json.loads(again.out)["effects"] == result["effects"]
+
+
+def test_close_without_fit_says_what_it_frees(cli: Cli, bench: Path) -> None:
+    asked = ("--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--effects", "coulomb_friction")
+    answer = cli("close", *asked)
+    assert answer.code == 0
+    assert "freeing mass:*, kp:*=shared" in answer.err
+    assert "nothing missing" in answer.out
+
+
+def test_demo_runs_on_logs_that_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("SYSID_BTR_DATA", str(tmp_path))
+    [case] = cases()
+    assert case.log.is_file()
+    assert Path(case.model).is_file()
+    (tmp_path / "emps").mkdir()
+    (tmp_path / "emps" / "emps.parquet").touch()
+    assert [c.name for c in cases()] == [case.name, "emps"]
+    assert "--fit 'kp:*=shared'" in case.command(tmp_path)
+
+
 def test_report_is_written_again_from_the_result(cli: Cli, asked: tuple[str, ...], tmp_path: Path) -> None:
     out = tmp_path / "o"
     cli("fit", *asked, *FREE, "--out", out)
@@ -372,7 +419,7 @@ def test_an_internal_error_is_short(
 def test_ctrl_c_keeps_the_journal_and_resume_gives_the_same_answer(
     asked: tuple[str, ...], tmp_path: Path, cli: Cli
 ) -> None:
-    search = (*asked, *FREE, "--estimator", "ga", "--seed", "1", "--max-evaluations", "6000")
+    search = (*asked, *FREE, "--estimator", "ga", "--seed", "1", "--max-evaluations", "600")
     out = tmp_path / "o"
     command = [sys.executable, "-m", "sysid_btr.cli", "fit", *search, "--out", str(out)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

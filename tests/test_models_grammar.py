@@ -110,7 +110,9 @@ def test_units_of_a_slide_are_those_of_forces_and_lengths() -> None:
     for scales in (None, {"slider": slide}):
         units = {
             p.name: p.unit
-            for m in parse_parameters(["damping:*", "frictionloss:*", "constant_force:*", "qpos0:*"], emps(), scales)
+            for m in parse_parameters(
+                ["damping:*", "frictionloss:*", "constant_force:*", "qpos0:*"], emps(), scales
+            )
             for p in m.parameters
         }
         assert units == {

@@ -51,6 +51,11 @@ PAPER_TO_WORLD = [2, 0, 1]
 """x left, y up, z forward as x forward, y left, z up."""
 
 
+SAME_FIELDS = (
+    *("body_mass", "body_inertia", "body_ipos", "dof_damping", "dof_armature", "jnt_limited"),
+    *("geom_size", "geom_pos", "geom_friction", "geom_contype", "geom_conaffinity"),
+    *("actuator_gainprm", "actuator_biasprm"),
+)
 LOWER_LEG = {"KneePitch": -0.210, "AnklePitch": -0.265, "AnkleRoll": -0.305}
 """Heights of geometries in the corrected model; the table left out the thigh."""
 
@@ -147,10 +152,7 @@ def test_table1_is_the_model_that_the_recordings_were_made_with(shared_data: Pat
 
     recorded = mujoco.MjModel.from_xml_path(str(shared_data / "nao_walk" / "nominal_free.xml"))
     ours = nao_table1().compile()
-    for name in (
-        "body_mass body_inertia body_ipos dof_damping dof_armature geom_size geom_pos geom_friction geom_contype "
-        "geom_conaffinity actuator_gainprm actuator_biasprm jnt_limited"
-    ).split():
+    for name in SAME_FIELDS:
         np.testing.assert_allclose(getattr(ours, name), getattr(recorded, name), atol=1e-12, err_msg=name)
     np.testing.assert_allclose(ours.body_pos[2:], recorded.body_pos[2:], atol=1e-12)
     wrong = ours.joint("LAnkleRoll").id
@@ -263,7 +265,9 @@ def test_the_drive_of_emps_saturates_at_ten_volts() -> None:
 
 def pendulum_log(seconds: float = 1.0, **channels: Any) -> Log:
     time = np.arange(round(seconds / 0.005) + 1) * 0.005
-    columns = {"command.pendulum": np.zeros(len(time))} | {k.replace("_", "."): v for k, v in channels.items()}
+    columns = {"command.pendulum": np.zeros(len(time))} | {
+        k.replace("_", "."): v for k, v in channels.items()
+    }
     filled = {k: np.broadcast_to(np.asarray(v, dtype=float), time.shape).copy() for k, v in columns.items()}
     return make_log(time, filled, extra={"servo": {"kp_register": 400}})
 
@@ -321,7 +325,8 @@ def test_the_duty_saturates_at_the_supply() -> None:
 
 
 @pytest.mark.parametrize(
-    "extra", [{"servo": {"kp_register": "high"}}, {"pendulum": {"mass": -1.0}}, {"servo": 400}, {"supply_nominal": 0}]
+    "extra",
+    [{"servo": {"kp_register": "high"}}, {"pendulum": {"mass": -1.0}}, {"servo": 400}, {"supply_nominal": 0}],
 )
 def test_metadata_that_cannot_be_used_is_told(extra: dict[str, object]) -> None:
     log = make_log(np.arange(10) * 0.01, {"command.pendulum": np.zeros(10)}, extra=extra)

@@ -17,7 +17,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord, Verdict
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
-from sysid_btr.diagnosis.refit import Fitted, judge, paired_t, refit, shorten
+from sysid_btr.diagnosis.refit import Fitted, inflate, judge, paired_t, refit, robust_refit, shorten
 from sysid_btr.diagnosis.scan import Question, Trace, questions, scan
 from sysid_btr.diagnosis.signature import proposals, signature
 from sysid_btr.diagnosis.words import message_of, sentence_of
@@ -42,10 +42,15 @@ REFIT_SECONDS = 20.0
 MAX_ROUNDS = 6
 REFITS = 7
 """Hypotheses refitted in each round."""
-SIMPLER = 1.02
-"""A simpler hypothesis wins if its held-out chi2 is within this factor of the best one's."""
-NEAR = 0.93
-"""A rival that explains at least this fraction of what the winner does is confused with it."""
+ROBUST_ROUNDS = 4
+SIMPLER = 0.06
+"""A simpler hypothesis wins if its misfit is within this of the best one's: 6 % of chi2 in one column."""
+NEAR = 0.15
+"""A rival whose misfit is within this of the winner's is confused with it, unless a paired test decides."""
+SETTLED = 0.8
+"""Once a hypothesis explains all there is, others are tried only if they promise this fraction of its gain."""
+ENOUGH = 0.004
+"""Fraction of a column's excess that may be left: effects have shapes, not only amounts."""
 STEP_GAIN = 0.03
 """An effect must remove this fraction of the held-out chi2, and of the excess at its joints."""
 STEP_T = 3.0
@@ -99,13 +104,18 @@ def close(
     study = first.study
     declared = first.modifiers
     before = judge(study, declared, first.values, first.replays)
-    state = _State(before, ())
+    if not _at_floor(before):
+        study, start = robust_refit(study, before, ROBUST_ROUNDS)
+        state = _State(start, ())
+        replays_robust = start.evaluations
+    else:
+        state, replays_robust = _State(before, ()), 0
     steps = [StepRecord((), (), before.train, before.holdout)]
-    replays = first.replays
+    replays = first.replays + replays_robust
     candidates: list[Candidate] = []
     note = "scan"
     for round_number in range(1, MAX_ROUNDS + 1):
-        if _at_floor(state.fitted):
+        if _at_floor(state.fitted) or _good_enough(before, state.fitted):
             break
         progress(done=round_number, total=None, best=state.fitted.holdout, note=f"round {round_number}: {note}")
         traces, residual = _scan(study, state, library)
@@ -113,13 +123,15 @@ def close(
         hypotheses = form_hypotheses(traces, len(residual), REFITS)
         trials: list[tuple[Hypothesis, Fitted]] = []
         for hypothesis in hypotheses:
+            if any(_at_floor(f) and hypothesis.gain < SETTLED * h.gain for h, f in trials):
+                continue  # another one explains all there is, and this one promises much less
+            trials.append((hypothesis, _try(study, state, hypothesis)))
             progress(
                 done=round_number,
                 total=None,
                 best=state.fitted.holdout,
-                note=f"round {round_number}: refit with {hypothesis}",
+                note=f"round {round_number}: with {hypothesis} held-out chi2 {trials[-1][1].holdout:.4g}",
             )
-            trials.append((hypothesis, _try(study, state, hypothesis)))
             replays += trials[-1][1].evaluations
         if not candidates or state.effects:
             candidates += _candidates(state.fitted, trials)
@@ -130,6 +142,8 @@ def close(
         rivals = tuple(
             dict.fromkeys(h.effect.name for h, f in trials if _rivals(state.fitted, winner, (h, f)))
         )
+        study, fitted = robust_refit(study, fitted, 1)
+        replays += fitted.evaluations
         state = _State(fitted, (*state.effects, hypothesis.modifier(study.scales)), (*state.rivals, rivals))
         steps.append(StepRecord((str(hypothesis),), (), fitted.train, fitted.holdout))
     state, removed, spent = _prune(study, state, declared)
@@ -138,6 +152,7 @@ def close(
         steps.append(StepRecord((), removed, state.fitted.train, state.fitted.holdout))
     if state.effects:
         state = _merge(study, state, declared)
+        study = inflate(study, state.fitted)
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="final fit")
         polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True)
         replays += polished.evaluations
@@ -224,6 +239,14 @@ def _at_floor(fitted: Fitted) -> bool:
     return fitted.holdout <= FLOOR_ALL and float(fitted.columns.max()) <= FLOOR_COLUMN
 
 
+def _good_enough(before: Fitted, now: Fitted) -> bool:
+    """Whether every column is at the floor, or has lost all but a trace of what it had above it."""
+    if len(before.columns) != len(now.columns):
+        return False
+    limit = np.maximum(FLOOR_COLUMN, 1 + ENOUGH * (before.columns - 1))
+    return bool(np.all(now.columns <= limit))
+
+
 def _gain(before: Fitted, after: Fitted) -> float:
     """Fraction of the held-out excess over the floor that is gone."""
     excess = max(before.holdout - 1.0, 1e-9)
@@ -237,9 +260,9 @@ def _choose(
     sound = [(h, f) for h, f in trials if np.isfinite(f.holdout) and _accepted(before, f)]
     if not sound:
         return None
-    best = min(f.holdout for _, f in sound)
-    near = [(h, f) for h, f in sound if f.holdout <= SIMPLER * best]
-    return min(near, key=lambda t: (t[0].size, t[1].holdout))
+    best = min(f.misfit for _, f in sound)
+    near = [(h, f) for h, f in sound if f.misfit <= best + SIMPLER]
+    return min(near, key=lambda t: (t[0].size, t[1].misfit))
 
 
 def _accepted(before: Fitted, after: Fitted) -> bool:
@@ -258,7 +281,7 @@ def _rivals(
     rival, alternative = other
     if rival.effect.name == hypothesis.effect.name or hypothesis.effect.name in rival.effect.includes:
         return False
-    if _gain(before, alternative) < NEAR * _gain(before, fitted):
+    if alternative.misfit > fitted.misfit + NEAR:
         return False
     both_best = np.concatenate([fitted.holdout_blocks, fitted.train_blocks])
     both_other = np.concatenate([alternative.holdout_blocks, alternative.train_blocks])
@@ -268,7 +291,7 @@ def _rivals(
 def _candidates(
     before: Fitted, trials: Sequence[tuple[Hypothesis, Fitted]]
 ) -> list[Candidate]:
-    ordered = sorted(trials, key=lambda t: t[1].holdout)
+    ordered = sorted(trials, key=lambda t: t[1].misfit)
     result = []
     for h, f in ordered:
         gain = _gain(before, f)
@@ -276,7 +299,7 @@ def _candidates(
             dict.fromkeys(
                 o.effect.name
                 for o, g in ordered
-                if o.effect.name != h.effect.name and gain > 0 and abs(_gain(before, g) - gain) < (1 - NEAR) * gain
+                if o.effect.name != h.effect.name and gain > 0 and abs(g.misfit - f.misfit) < NEAR
             )
         )
         amplitude = float(f.values[len(f.values) - h.size + h.effect.main])

@@ -139,19 +139,15 @@ def _unit(trace: Trace, residuals: int, basis: FloatArray | None) -> FloatArray 
 
 
 def _without_idle(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Drop an effect that includes a simpler one and does no better at the lead place."""
-    best: dict[str, float] = {}
-    for h in ranked:
-        best[h.effect.name] = max(best.get(h.effect.name, 0.0), h.gain)
-    return [
-        h
-        for h in ranked
-        if not any(best.get(simple, 0.0) * BETTER >= h.gain for simple in h.effect.includes)
-    ]
+    """Drop an effect that includes a simpler one where all that it adds is zero."""
+    named = {h.effect.name for h in ranked}
+    return [h for h in ranked if not (named & set(h.effect.includes) and _idle(h))]
 
 
-BETTER = 1.03
-"""A more general effect must promise this much more than the special case it includes."""
+def _idle(h: Hypothesis) -> bool:
+    main = h.start[h.effect.main :: len(h.effect.kinds)]
+    size = np.abs(h.start).max()
+    return bool(np.all(np.abs(main) <= 1e-3 * size))
 
 
 def _varied(ranked: Sequence[Hypothesis], most: int) -> list[Hypothesis]:

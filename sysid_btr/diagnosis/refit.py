@@ -15,6 +15,10 @@ from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem
 
 
+CLEAN = 1.02
+"""Chi2 of a column below which it counts as explained."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """A model with its parameters refitted.
@@ -23,9 +27,8 @@ class Fitted:
     ----------
     modifiers, values : the model.
     train, holdout : mean square of error over noise floor.
-    holdout_columns, columns : the same for each log column, on held-out and on all data.
-    train_blocks, holdout_blocks : sums of squares by stretch of half a second, for paired comparisons.
-    count : (train, holdout) number of residuals.
+    train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
+    train_blocks, holdout_blocks : sums of squares, whitened as fitted, by stretch of half a second.
     evaluations : candidates simulated.
     """
 
@@ -33,12 +36,18 @@ class Fitted:
     values: FloatArray
     train: float
     holdout: float
-    train_blocks: FloatArray
-    holdout_blocks: FloatArray
+    train_columns: FloatArray
     holdout_columns: FloatArray
     columns: FloatArray
-    count: tuple[int, int]
+    train_blocks: FloatArray
+    holdout_blocks: FloatArray
     evaluations: int
+
+    @property
+    def misfit(self) -> float:
+        """Sum over columns of the logarithm of held-out chi2: twice the log-likelihood lost a sample where
+        each column's error size is unknown. One bad column cannot drown the others."""
+        return float(np.sum(np.log(np.maximum(self.holdout_columns, CLEAN))))
 
 
 def refit(
@@ -49,10 +58,10 @@ def refit(
     polish: bool = False,
     iterations: int = 8,
 ) -> Fitted:
-    """Least squares from a first guess; `polish` runs to convergence."""
+    """Least squares from a first guess; `polish` runs to convergence with central differences."""
     problem = study.train_problem(modifiers, np.clip(start, *_bounds(modifiers)))
     estimator = LeastSquares(
-        confirm=False,
+        confirm=polish,
         max_iterations=30 if polish else iterations,
         tolerance=1e-6 if polish else 2e-4,
     )
@@ -67,32 +76,61 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
     train = study.train_problem(modifiers)
     holdout = study.holdout_problem(modifiers)
     r, s = train.residuals(values[None])[0], holdout.residuals(values[None])[0]
+    train_columns, holdout_columns = _by_column(train, r), _by_column(holdout, s)
+    a, b = _counts(train), _counts(holdout)
+    same = len(a) == len(b)
     return Fitted(
         modifiers=modifiers,
         values=values,
-        train=float(r @ r) / len(r),
-        holdout=float(s @ s) / len(s),
+        train=float(np.average(train_columns, weights=a)),
+        holdout=float(np.average(holdout_columns, weights=b)),
+        train_columns=train_columns,
+        holdout_columns=holdout_columns,
+        columns=(train_columns * a + holdout_columns * b) / np.maximum(a + b, 1)
+        if same
+        else np.concatenate([train_columns, holdout_columns]),
         train_blocks=_by_block(train, r),
         holdout_blocks=_by_block(holdout, s),
-        holdout_columns=_by_column(holdout, s),
-        columns=_pooled(train, r, holdout, s),
-        count=(len(r), len(s)),
         evaluations=evaluations + 1,
     )
 
 
+def inflate(study: Study, fitted: Fitted) -> Study:
+    """The study with each column's noise inflated to the size of the error that a model leaves in it.
+
+    Iterating fits with this is maximum likelihood where every column's error size is unknown.
+    """
+    problem = study.train_problem(fitted.modifiers)
+    worst: dict[tuple[str, str], float] = {}
+    for chi2, (_, target, k) in zip(fitted.train_columns, problem.columns, strict=True):
+        key = (target.channel, target.joints[k])
+        worst[key] = max(worst.get(key, 1.0), float(np.sqrt(chi2)) if np.isfinite(chi2) else 1.0)
+    return replace(study, inflation=worst)
+
+
+def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitted]:
+    """Refit with inflated noise until the columns' errors settle."""
+    for _ in range(rounds):
+        before = fitted.misfit
+        study = inflate(study, fitted)
+        again = refit(study, fitted.modifiers, fitted.values)
+        fitted = replace(again, evaluations=again.evaluations + fitted.evaluations)
+        if abs(before - fitted.misfit) < 0.02 * len(fitted.columns):
+            break
+    study = inflate(study, fitted)
+    return study, judge(study, fitted.modifiers, fitted.values, fitted.evaluations)
+
+
+def _counts(problem: ReplayProblem) -> FloatArray:
+    return np.bincount(problem.column_labels, minlength=len(problem.columns)).astype(float)
+
+
 def _by_column(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
-    labels, size = problem.column_labels, len(problem.columns)
-    return np.bincount(labels, residual**2, size) / np.maximum(np.bincount(labels, minlength=size), 1)
-
-
-def _pooled(train: ReplayProblem, r: FloatArray, holdout: ReplayProblem, s: FloatArray) -> FloatArray:
-    """Mean square by column over fitted and held-out data, where both have the same columns."""
-    if len(train.columns) != len(holdout.columns):
-        return np.concatenate([_by_column(train, r), _by_column(holdout, s)])
-    a, b = np.bincount(train.column_labels), np.bincount(holdout.column_labels)
-    total: FloatArray = (_by_column(train, r) * a + _by_column(holdout, s) * b) / np.maximum(a + b, 1)
-    return total
+    """Mean square of error over noise floor of each column, however it was whitened."""
+    sums = np.bincount(problem.column_labels, residual**2, len(problem.columns))
+    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
+    mean: FloatArray = factor * sums / np.maximum(_counts(problem), 1)
+    return mean
 
 
 def _by_block(problem: ReplayProblem, residual: FloatArray) -> FloatArray:

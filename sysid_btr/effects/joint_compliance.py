@@ -55,8 +55,9 @@ class JointCompliance(Effect):
         ids = np.array([rig.model.joint(name + LINK_SUFFIX).id for name in self.places])
         dofs = rig.model.jnt_dofadr[ids]
         mobility = rig.model.dof_invweight0[dofs]
-        # the stiffest spring that the step resolves: (omega h)^2 < 0.5
-        stiffest = 0.5 / (mobility * rig.timestep**2)
+        # the stiffest spring that stays stable, with a margin of 2 (Euler) or 4 (RK4) for other poses:
+        # (omega h)^2 = 2
+        stiffest = 2.0 / (mobility * rig.timestep**2)
         stiffness = 1 / np.maximum(values[:, :, 0], 1 / stiffest)
         rig.array("jnt_stiffness")[:, ids] = stiffness
         most = 0.5 / (mobility * rig.timestep)

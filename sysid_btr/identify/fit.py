@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 SHIFT_TOLERATED = 0.3
 """Shift of an estimate under half the step, in standard errors, beyond which the step is halved."""
 MAX_REFINEMENTS = 3
+FAR = 3.0
+"""Mean squared whitened residual beyond which a model is too wrong for its step to matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,8 @@ def fit(
         found = estimates(problem.parameters, values, jacobian, residual, problem.blocks)
         std = np.array([e.std for e in found])
         worst = np.max(np.abs(shift) / np.maximum(std, 1e-300), initial=0.0)
-        if worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler":
+        misfit = float(residual @ residual) / max(len(residual), 1)
+        if worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or misfit > FAR:
             break
         study = replace(study, numerics=study.numerics.halved())
         problem = study.train_problem(modifiers, values)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,6 +36,8 @@ class Study:
     split : (s) for each held-out episode the time from which it is scored.
     channels : channels that are fitted.
     numerics : integrator and step; chosen by a convergence check.
+    inflation : (channel, joint) -> factor on its noise floor in what is minimised; 1 where silent. Keeps a
+        column that the model cannot explain yet from distorting parameters that others tell.
     numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
     """
 
@@ -47,6 +49,7 @@ class Study:
     numerics: Numerics
     numerics_error: float
     threads: int = 0
+    inflation: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @cached_property
     def scales(self) -> Scales:
@@ -86,6 +89,13 @@ class Study:
         targets = make_targets(log, replay.index.joints, present, WARM_UP)
         if not targets:
             raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
+        if self.inflation:
+            targets = tuple(
+                replace(
+                    t, sigma=t.noise * [self.inflation.get((t.channel, joint), 1.0) for joint in t.joints]
+                )
+                for t in targets
+            )
         if begin > 0 or np.isfinite(end):
             time = log.time - log.time[0]
             targets = tuple(t.window(begin, end, time) for t in targets)

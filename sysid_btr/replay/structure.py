@@ -36,9 +36,7 @@ def limbs(model: mujoco.MjModel) -> dict[str, int]:
     for e in range(model.neq):
         first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
         if model.eq_type[e] == joint_equality and second >= 0:
-            join(
-                int(model.dof_treeid[model.jnt_dofadr[first]]), int(model.dof_treeid[model.jnt_dofadr[second]])
-            )
+            join(*(int(model.dof_treeid[model.jnt_dofadr[j]]) for j in (first, second)))
         elif model.eq_type[e] != joint_equality:
             for t in range(1, len(tree)):
                 join(0, t)

@@ -1,0 +1,309 @@
+"""From a number to a recording: robot, motion, masses, gains, effects that the log can show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.blind.sizes import ALIKE, LIBRARY, OUTSIDE, Recipe, Stage
+from benchmarks.recorder import MOTIONS, Recording, Sensors, exact_channels, load_robot
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from benchmarks.recorder.effects import Effect
+    from benchmarks.recorder.robot import Robot
+
+    Array = NDArray[np.float64]
+    Names = tuple[str, ...]
+
+SAMPLE_LOGS = Path(__file__).parents[2] / "sample_logs"
+PARTS: dict[str, int] = {"single": 60, "pair": 20, "outside": 10, "clean": 20}
+"""Logs in each part."""
+VISIBLE = 2.0
+"""What an effect must add to an exact sensor at each of its joints, in noise floors (rms over the log) ..."""
+VISIBLE_EVERYWHERE, MOST = 1.5, 0.85
+"""... and at this fraction of them where it sits at all joints."""
+TOO_MUCH = 0.12
+"""Rms change of position (rad) beyond which the robot would have been repaired, not identified."""
+TRIES_A_MOTION = 6
+ROUGH = 2.0e-3
+"""Step (s) of the recordings that only judge a draw."""
+NUDGE = 0.05
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One robot of the benchmark: the model, what is declared free, and where masses are wrong."""
+
+    name: str
+    model: Path
+    seconds: float
+    fit: Names
+    free: Names
+    wrong: Names
+    loadable: Names
+
+
+BENCHES: dict[str, Bench] = {
+    "nao": Bench(
+        name="nao",
+        model=SAMPLE_LOGS / "nao.xml",
+        seconds=12.0,
+        fit=("mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"),
+        free=tuple(s + b for b in ("KneePitch", "HipPitch", "HipRoll", "ShoulderRoll") for s in "RL"),
+        wrong=tuple(s + b for b in ("KneePitch", "HipPitch", "ShoulderRoll") for s in "RL"),
+        loadable=(
+            *("RElbowRoll", "LElbowRoll", "RAnkleRoll", "LAnkleRoll", "HeadPitch"),
+            *("RShoulderRoll", "LShoulderRoll", "RHipPitch", "LHipPitch", "RKneePitch", "LKneePitch"),
+        ),
+    ),
+    "leg": Bench(
+        name="leg",
+        model=SAMPLE_LOGS / "leg.xml",
+        seconds=15.0,
+        fit=("mass:HipPitch,KneePitch", "kp:*=shared", "kv:*=shared"),
+        free=("HipPitch", "KneePitch"),
+        wrong=("HipPitch", "KneePitch"),
+        loadable=("AnkleRoll", "KneePitch", "HipPitch"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One log of the benchmark.
+
+    Attributes
+    ----------
+    series, part, number : which one; another series is another draw of everything.
+    bench : robot.
+    spec : the recording, its effects resolved to names.
+    draws : how many draws it took until the log could show the effects.
+    """
+
+    series: int
+    part: str
+    number: int
+    bench: Bench
+    spec: Recording
+    draws: int
+
+    @property
+    def id(self) -> str:
+        prefix = f"{self.series}/" if self.series else ""
+        return f"{prefix}{self.part}-{self.number:02d}"
+
+
+def draw(part: str, number: int, series: int = 0) -> Case:
+    """The log `number` (from 1) of a part; the same arguments give the same log."""
+    rng = np.random.default_rng([20260, series, list(PARTS).index(part), number])
+    bench = BENCHES["nao" if _on_nao(part, number) else "leg"]
+    if part == "clean":
+        return Case(series, part, number, bench, _clean(rng, bench, number), 1)
+    names = _names(rng, part, number)
+    draws = 0
+    for _ in count():
+        if draws > 40 * TRIES_A_MOTION:
+            raise RuntimeError(f"{part} {number}: no draw of {', '.join(names)} shows on this robot")
+        recipes = [(LIBRARY | OUTSIDE)[name] for name in names]
+        effort = any(r.effort for r in recipes) and number % 2 == 0
+        if part == "single":  # the second log of an effect has what the first had not
+            effort = recipes[0].effort and (number // len(LIBRARY) + number) % 2 == 0
+        plain = _plain(rng, bench, str(rng.choice(_motions(recipes))), Sensors(effort=effort))
+        view = View.of(plain, bench)
+        for _ in range(TRIES_A_MOTION):
+            draws += 1
+            effects = _effects(rng, bench, recipes, view.stage)
+            if view.shows(effects):
+                return Case(series, part, number, bench, replace(plain, effects=effects), draws)
+    raise AssertionError
+
+
+def cases(part: str, series: int = 0) -> Iterator[Case]:
+    """All logs of a part."""
+    yield from (draw(part, number, series) for number in range(1, PARTS[part] + 1))
+
+
+def _on_nao(part: str, number: int) -> bool:
+    """Two in five; each effect gets its turn on either robot."""
+    return (number + number // len(LIBRARY)) % 5 in (0, 2)
+
+
+def _names(rng: Generator, part: str, number: int) -> Names:
+    if part == "single":
+        return (list(LIBRARY)[(number - 1) % len(LIBRARY)],)
+    if part == "outside":
+        return (list(OUTSIDE)[(number - 1) % len(OUTSIDE)],)
+    while True:
+        first, second = (str(n) for n in rng.choice(list(LIBRARY), 2, replace=False))
+        common = set(LIBRARY[first].motions) & set(LIBRARY[second].motions)
+        if common and not any({first, second} <= pair for pair in ALIKE):
+            return first, second
+
+
+def _motions(recipes: list[Recipe]) -> list[str]:
+    return [m for m in recipes[0].motions if all(m in r.motions for r in recipes)]
+
+
+def _plain(rng: Generator, bench: Bench, motion: str, sensors: Sensors) -> Recording:
+    """The robot with wrong masses and gains, and nothing else."""
+    bodies = rng.choice(bench.wrong, min(int(rng.integers(2, 4)), len(bench.wrong)), replace=False)
+    return Recording(
+        robot=bench.model,
+        motion=motion,
+        seed=int(rng.integers(1, 2**31)),
+        seconds=bench.seconds,
+        mass={str(b): round(float(rng.uniform(0.8, 1.25)), 3) for b in bodies},
+        kp=round(float(rng.uniform(0.85, 1.15)), 3),
+        kv=round(float(rng.uniform(0.85, 1.2)), 3) if rng.random() < 0.3 else 1.0,
+        sensors=sensors,
+    )
+
+
+def _clean(rng: Generator, bench: Bench, number: int) -> Recording:
+    """Other motions, sensors and numerics; the servo of one in five is digital, as its metadata says."""
+    motion = list(MOTIONS)[(number - 1) % len(MOTIONS)]
+    noise = float(rng.uniform(1.0e-4, 8.0e-4))
+    sensors = Sensors(bits=int(rng.choice([0, 12, 12, 14])), position_noise=noise, effort=bool(rng.random() < 0.25))
+    spec = _plain(rng, bench, motion, sensors)
+    step = float(rng.choice([2.5e-4, 5.0e-4, 1.0e-3]))
+    return replace(spec, step=step, servo_period=2.0e-3 if number % 5 == 4 else None)
+
+
+def _effects(rng: Generator, bench: Bench, recipes: list[Recipe], stage: Stage) -> tuple[Effect, ...]:
+    taken: list[str] = []
+    effects: list[Effect] = []
+    for recipe in recipes:
+        where = _places(rng, bench, recipe, stage.robot, taken)
+        effects.append(recipe.draw(rng, stage, where).resolved(stage.robot))
+        if len(where) < stage.robot.n:
+            taken += where
+    return tuple(effects)
+
+
+def _places(rng: Generator, bench: Bench, recipe: Recipe, robot: Robot, taken: list[str]) -> Names:
+    """One place; on the Nao often a left-right pair; all joints where that is sensible."""
+    if recipe.scope == "robot":
+        return ()
+    if recipe.scope == "body":
+        return (str(rng.choice([b for b in bench.loadable if b not in taken])),)
+    free = [j for j in robot.joints if j not in taken]
+    if recipe.scope == "two":
+        a, b = sorted(int(i) for i in rng.choice(len(free), 2, replace=False))
+        return free[a], free[b]
+    if recipe.everywhere and not taken and rng.random() < 0.45:
+        return robot.joints
+    joint = str(rng.choice(free))
+    other = {"R": "L", "L": "R"}.get(joint[0], "") + joint[1:]
+    if other in free and rng.random() < 0.5:
+        return tuple(j for j in free if j in (joint, other))
+    return (joint,)
+
+
+@dataclass(frozen=True)
+class View:
+    """What exact sensors see of one motion without effects, and what declared parameters can imitate.
+
+    Attributes
+    ----------
+    plain : recording without effects.
+    stage : sizes.
+    columns : names of the sensors' columns, positions first; `floor` (c,) their noise, SI.
+    exact : (samples, c) without effects.
+    basis : (samples c, p) orthonormal; the changes, in noise floors, that masses and gains can make.
+    """
+
+    plain: Recording
+    stage: Stage
+    columns: Names
+    floor: Array
+    exact: Array
+    basis: Array
+
+    @classmethod
+    def of(cls, plain: Recording, bench: Bench) -> View:
+        robot = load_robot(bench.model)
+        rough = replace(plain, step=ROUGH)
+        with_effort = replace(rough, sensors=replace(plain.sensors, effort=True))
+        time, seen = exact_channels(with_effort)
+        position = np.column_stack([seen[f"position.{j}"] for j in robot.joints])
+        torque = np.column_stack([seen[f"effort.{j}"] for j in robot.joints])
+        speed = np.gradient(position, time, axis=0)
+        stage = Stage(
+            robot=robot,
+            seconds=plain.seconds,
+            torque_rms=np.sqrt(np.mean(torque**2, axis=0)),
+            torque_peak=np.abs(torque).max(axis=0),
+            speed_peak=np.abs(speed).max(axis=0),
+            centre=position.mean(axis=0),
+            spread=position.std(axis=0),
+        )
+        sensors = plain.sensors
+        noise = float(np.hypot(sensors.position_noise, sensors.tick / np.sqrt(12.0)))
+        kinds = (("position", noise), ("effort", sensors.effort_noise))[: 2 if sensors.effort else 1]
+        columns = tuple(f"{kind}.{j}" for kind, _ in kinds for j in robot.joints)
+        floor = np.concatenate([np.full(robot.n, size) for _, size in kinds])
+        exact = np.column_stack([seen[c] for c in columns])
+        nudged = [
+            *(replace(rough, mass=_times(plain.mass, body)) for body in bench.free),
+            replace(rough, kp=float(plain.kp) * (1 + NUDGE)),  # type: ignore[arg-type]
+            replace(rough, kv=float(plain.kv) * (1 + NUDGE)),  # type: ignore[arg-type]
+        ]
+        changes = [((_table(spec, columns) - exact) / floor).ravel() for spec in nudged]
+        left, size, _ = np.linalg.svd(np.column_stack(changes), full_matrices=False)
+        return cls(plain, stage, columns, floor, exact, left[:, size > 1e-3 * size[0]])
+
+    def shows(self, effects: tuple[Effect, ...]) -> bool:
+        """Whether each effect shows beside the others, at each of its places, beyond what masses and gains do."""
+        try:
+            whole = _table(replace(self.plain, effects=effects, step=ROUGH), self.columns)
+            for k, effect in enumerate(effects):
+                others = effects[:k] + effects[k + 1 :]
+                without = (
+                    _table(replace(self.plain, effects=others, step=ROUGH), self.columns) if others else self.exact
+                )
+                if not self._shows(effect, whole - without):
+                    return False
+        except FloatingPointError:  # the robot with this effect is unstable
+            return False
+        return True
+
+    def _shows(self, effect: Effect, change: Array) -> bool:
+        robot = self.stage.robot
+        raw = _rms(change)[: robot.n]
+        if raw.max() > TOO_MUCH:
+            return False
+        white = (change / self.floor).ravel()
+        left = _rms((white - self.basis @ (self.basis.T @ white)).reshape(change.shape))
+        beyond = left.reshape(-1, robot.n).max(axis=0)
+        strength = np.minimum(raw / self.floor[0], beyond)
+        if effect.acts_on == "body":
+            return bool(strength.max() >= VISIBLE)
+        if effect.acts_on == "robot" or effect.name == "voltage_sag":
+            return bool(np.sort(strength)[-2] >= VISIBLE)
+        own = strength[robot.indices(effect.where)]
+        if own.size > 2:
+            return bool(np.mean(own >= VISIBLE_EVERYWHERE) >= MOST)
+        return bool(own.min() >= VISIBLE)
+
+
+def _times(mass: Mapping[str, float] | float, body: str) -> dict[str, float]:
+    table = dict(mass) if isinstance(mass, Mapping) else {"*": mass}
+    table[body] = table.get(body, 1.0) * (1 + NUDGE)
+    return table
+
+
+def _table(spec: Recording, columns: Names) -> Array:
+    _, seen = exact_channels(spec)
+    return np.column_stack([seen[c] for c in columns])
+
+
+def _rms(x: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(x**2, axis=0)))
