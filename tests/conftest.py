@@ -37,7 +37,7 @@ def make_good_log(seed: int = 0, n: int = 800, period: float = 0.01) -> Log:
         position = np.round((response + rng.normal(scale=0.001, size=n)) / tick) * tick
         channels[f"command.{joint}"] = command
         channels[f"position.{joint}"] = position
-    for i, joint in enumerate(GOOD_JOINTS):
+    for joint in GOOD_JOINTS:
         channels[f"velocity.{joint}"] = np.gradient(channels[f"position.{joint}"], period)
         channels[f"temperature.{joint}"] = np.full(n, 38.0)
     tilt = 0.2 * np.sin(2.0 * time)

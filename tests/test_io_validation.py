@@ -75,7 +75,7 @@ def raw_columns(log: Log) -> dict[str, object]:
 
 def test_a_good_log_has_no_problem(good_log: Log, check) -> None:
     assert check(good_log) == ()
-    ranges = {joint: (-0.6, 0.6) for joint in JOINTS}
+    ranges = dict.fromkeys(JOINTS, (-0.6, 0.6))
     assert check(good_log, joints=JOINTS, ranges=ranges) == ()
 
 
@@ -660,7 +660,7 @@ def test_degrees(good_log: Log, check, channels: tuple[str, ...]) -> None:
 
 
 def test_small_degrees_against_the_range(good_log: Log, check) -> None:
-    ranges = {joint: (-0.6, 0.6) for joint in JOINTS}
+    ranges = dict.fromkeys(JOINTS, (-0.6, 0.6))
     small = np.degrees(0.03 * np.sin(good_log.time))
     log = change(good_log, command__HeadYaw=small, position__HeadYaw=small, velocity__HeadYaw=None)
     problem = only(check(log, ranges=ranges), "units.degrees")

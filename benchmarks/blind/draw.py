@@ -114,8 +114,8 @@ def draw(part: str, number: int, series: int = 0) -> Case:
             raise RuntimeError(f"{part} {number}: no draw of {', '.join(names)} shows on this robot")
         recipes = [(LIBRARY | OUTSIDE)[name] for name in names]
         effort = any(r.effort for r in recipes) and number % 2 == 0
-        if part == "single":  # the second log of an effect has what the first had not
-            effort = recipes[0].effort and (number // len(LIBRARY) + number) % 2 == 0
+        if part == "single":  # the second log of an effect lacks what the first has
+            effort = recipes[0].effort and _round(number) % 2 == 0
         plain = _plain(rng, bench, str(rng.choice(_motions(recipes))), Sensors(effort=effort))
         view = View.of(plain, bench)
         for _ in range(TRIES_A_MOTION):
@@ -133,7 +133,12 @@ def cases(part: str, series: int = 0) -> Iterator[Case]:
 
 def _on_nao(part: str, number: int) -> bool:
     """Two in five; each effect gets its turn on either robot."""
-    return (number + number // len(LIBRARY)) % 5 in (0, 2)
+    return (number + _round(number)) % 5 in (0, 2)
+
+
+def _round(number: int) -> int:
+    """How often each effect of the library has had its turn before."""
+    return (number - 1) // len(LIBRARY)
 
 
 def _names(rng: Generator, part: str, number: int) -> Names:

@@ -92,8 +92,8 @@ def _speed_torque(rng: Generator, stage: Stage, where: Names) -> Effect:
 
 def _sag(rng: Generator, stage: Stage, where: Names) -> Effect:
     if rng.random() < 0.5:
-        return planted.VoltageSag(rate=rng.uniform(0.008, 0.02))
-    share = rng.uniform(0.1, 0.25) / float(stage.torque_rms.sum())
+        return planted.VoltageSag(rate=rng.uniform(0.01, 0.03))
+    share = rng.uniform(0.15, 0.3) / float(stage.torque_rms.sum())
     return planted.VoltageSag(rate=0.0, per_torque=share, lag=0.01)
 
 
@@ -213,7 +213,7 @@ LIBRARY: dict[str, Recipe] = {
         ("poses", "steps", "multisine"),
         everywhere=True,
     ),
-    "voltage_sag": Recipe(_sag, ("multisine", "gait", "chirp"), scope="robot"),
+    "voltage_sag": Recipe(_sag, ("multisine", "steps", "chirp"), scope="robot"),
     "thermal_derating": Recipe(_thermal, ("steps", "multisine", "gait")),
     "payload": Recipe(_payload, SMOOTH, scope="body"),
     "com_offset": Recipe(_com_offset, SMOOTH, scope="body"),

@@ -17,7 +17,6 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord, Verdict
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
-from sysid_btr.diagnosis.refit import Fitted, inflate, judge, paired_t, refit, robust_refit, shorten
 from sysid_btr.diagnosis.scan import Question, Trace, questions, scan
 from sysid_btr.diagnosis.signature import proposals, signature
 from sysid_btr.diagnosis.words import message_of, sentence_of
@@ -28,6 +27,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.fit import as_modifiers, fit, numerics_shift
 from sysid_btr.identify.intervals import Estimate, estimates
+from sysid_btr.identify.refit import Fitted, inflate, judge, paired_t, refit, robust_refit, shorten
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.study import Study, nominal_start
 from sysid_btr.models.modifier import Modifier
@@ -42,7 +42,6 @@ REFIT_SECONDS = 20.0
 MAX_ROUNDS = 6
 REFITS = 7
 """Hypotheses refitted in each round."""
-ROBUST_ROUNDS = 4
 SIMPLER = 0.06
 """A simpler hypothesis wins if its misfit is within this of the best one's: 6 % of chi2 in one column."""
 NEAR = 0.15
@@ -55,6 +54,8 @@ STEP_GAIN = 0.03
 """An effect must remove this fraction of the held-out chi2, and of the excess at its joints."""
 STEP_T = 3.0
 """... with this paired t over half-second stretches of held-out data."""
+STEP_CERTAIN = 0.3
+"""Fraction of the held-out chi2 of a column whose loss needs no test."""
 EXPLAINED = 0.85
 """Fraction of the held-out excess that must be gone for effects to be named."""
 AT_FLOOR = 1.10
@@ -104,14 +105,9 @@ def close(
     study = first.study
     declared = first.modifiers
     before = judge(study, declared, first.values, first.replays)
-    if not _at_floor(before):
-        study, start = robust_refit(study, before, ROBUST_ROUNDS)
-        state = _State(start, ())
-        replays_robust = start.evaluations
-    else:
-        state, replays_robust = _State(before, ()), 0
+    state = _State(before, ())
     steps = [StepRecord((), (), before.train, before.holdout)]
-    replays = first.replays + replays_robust
+    replays = first.replays
     candidates: list[Candidate] = []
     note = "scan"
     for round_number in range(1, MAX_ROUNDS + 1):
@@ -270,7 +266,9 @@ def _accepted(before: Fitted, after: Fitted) -> bool:
     drop = (before.holdout - after.holdout) / before.holdout
     local = float(np.max((before.holdout_columns - after.holdout_columns) / before.holdout_columns))
     t = paired_t(after.holdout_blocks, before.holdout_blocks)
-    return (drop > STEP_GAIN or local > 5 * STEP_GAIN) and t > STEP_T and after.train < before.train
+    # an effect that acts in few stretches (a limit, a push) has a small t however large it is there
+    certain = t > STEP_T or max(drop, local) > STEP_CERTAIN
+    return (drop > STEP_GAIN or local > 5 * STEP_GAIN) and certain and after.train < before.train
 
 
 def _rivals(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.effects.base import Effect, Probe
+from sysid_btr.models.fields import allow_any_inertia
 from sysid_btr.models.modifier import Kind, Rig
 from sysid_btr.models.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,9 @@ class ComOffset(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         d = 0.01
         return (((d, 0.0, 0.0), (0.0, d, 0.0), (0.0, 0.0, d)),)
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        allow_any_inertia(spec, self.places)
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         ids = [rig.model.body(name).id for name in self.places]

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.effects.base import Effect, Probe
+from sysid_btr.models.fields import allow_any_inertia
 from sysid_btr.models.modifier import Kind, Rig
 from sysid_btr.models.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,9 @@ class Payload(Effect):
         values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
         values[0] *= total
         return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        allow_any_inertia(spec, self.places)
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         mass, inertia = rig.array("body_mass"), rig.array("body_inertia")

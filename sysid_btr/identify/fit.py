@@ -15,6 +15,7 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, si
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.intervals import Estimate, estimates
+from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
 from sysid_btr.models.modifier import Modifier
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 SHIFT_TOLERATED = 0.3
 """Shift of an estimate under half the step, in standard errors, beyond which the step is halved."""
 MAX_REFINEMENTS = 3
+MISFIT = 1.5
+"""Chi2 of a column beyond which its error, not its noise, sets its weight."""
+ROBUST_ROUNDS = 4
 FAR = 3.0
 """Mean squared whitened residual beyond which a model is too wrong for its step to matter."""
 
@@ -94,15 +98,23 @@ def fit(
     problem = study.train_problem(modifiers, start)
     if not problem.parameters:
         raise UsageError("nothing to fit: free at least one parameter, for example --fit 'mass:*'")
+    rough = 0
+    if isinstance(estimator, LeastSquares):
+        # first find how large each column's error is, then weigh the columns by it
+        coarse = refit(study, modifiers, problem.start)
+        if float(coarse.train_columns.max()) > MISFIT:
+            study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
+        rough = coarse.evaluations
+        problem = study.train_problem(modifiers, coarse.values)
     result = estimator.fit(problem, rng=rng, budget=budget or Budget(), journal=journal, progress=progress)
-    replays = result.evaluations
+    replays = result.evaluations + rough
     values, jacobian, residual = _at_optimum(problem, result)
     for _ in range(MAX_REFINEMENTS):
         shift = numerics_shift(problem, values, jacobian, residual)
         found = estimates(problem.parameters, values, jacobian, residual, problem.blocks)
         std = np.array([e.std for e in found])
         worst = np.max(np.abs(shift) / np.maximum(std, 1e-300), initial=0.0)
-        misfit = float(residual @ residual) / max(len(residual), 1)
+        misfit = before_chi2(problem, residual)
         if worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or misfit > FAR:
             break
         study = replace(study, numerics=study.numerics.halved())
@@ -132,6 +144,12 @@ def as_modifiers(study: Study, parameters: Sequence[str] | Sequence[Modifier]) -
     """Expressions of the grammar as modifiers; modifiers as they are."""
     given = tuple(p for p in parameters if isinstance(p, Modifier))
     return (*given, *study.declare([p for p in parameters if isinstance(p, str)]))
+
+
+def before_chi2(problem: ReplayProblem, residual: FloatArray) -> float:
+    """Mean square of error over noise floor, however the residual was whitened."""
+    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
+    return float(np.mean(residual**2 * factor[problem.column_labels]))
 
 
 def numerics_shift(

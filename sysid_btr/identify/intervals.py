@@ -152,7 +152,7 @@ def _tell(
     if alone > 0.5 * min(std[i], NOT_IDENTIFIABLE * span):
         return state, (
             "hardly any sensor of this log responds to it: even with all else known, "
-            f"its standard error would be {alone:.2g} {parameter.unit}"
+            f"its standard error would be {alone:.2g}{'' if parameter.unit == '1' else ' ' + parameter.unit}"
         )
     deviation = np.sqrt(np.diag(cov))
     with np.errstate(invalid="ignore"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -168,7 +169,7 @@ def split_episodes(log: Log) -> list[Log]:
     """Each episode of a log as a log of its own."""
     borders = np.flatnonzero(np.diff(log.episode) != 0) + 1
     edges = [0, *borders.tolist(), len(log)]
-    return [log.window(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a > 1]
+    return [log.window(a, b) for a, b in pairwise(edges) if b - a > 1]
 
 
 def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, threads: int = 0) -> Scales:
@@ -191,7 +192,7 @@ def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, thread
     reach = np.max(span, axis=0)
 
     def rms(x: FloatArray) -> FloatArray:
-        return np.sqrt(np.nanmean(np.square(x), axis=0))
+        return np.asarray(np.sqrt(np.nanmean(np.square(x), axis=0)))
 
     scales = {}
     for i, joint in enumerate(joints):

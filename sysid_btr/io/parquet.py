@@ -105,7 +105,7 @@ def write_log(log: Log, path: str | os.PathLike[str], *, overwrite: bool = False
             pq.write_table(table, file)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(part, path)
+        part.replace(path)
     except OSError as error:
         reason = error.strerror or error
         raise UsageError(

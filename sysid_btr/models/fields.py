@@ -49,6 +49,12 @@ def _servos(rig: Rig, places: tuple[str, ...]) -> IntArray:
     return result
 
 
+def allow_any_inertia(spec: mujoco.MjSpec, places: tuple[str, ...]) -> None:
+    """Tell MuJoCo that these bodies' centres of mass will move: no short cuts for symmetric bodies."""
+    for name in places:
+        spec.body(name).simple = 0
+
+
 @dataclass(frozen=True)
 class Mass(FieldModifier):
     """Mass of a body as a factor of the nominal; the inertia follows."""
@@ -82,6 +88,9 @@ class Com(FieldModifier):
     name: ClassVar[str] = "com"
     scope: ClassVar[Scope] = "body"
     kinds: ClassVar[tuple[Kind, ...]] = tuple(Kind(axis, "m", 0.0, -0.05, 0.05, 0.005) for axis in "xyz")
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        allow_any_inertia(spec, self.places)
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         rig.array("body_ipos")[:, _bodies(rig, self.places)] += values

@@ -162,19 +162,6 @@ class ReplayProblem:
         episodes = tuple(replace(e, replay=replace(e.replay, numerics=numerics)) for e in self.episodes)
         return ReplayProblem(episodes, self.start)
 
-    def with_sigma(self, sigma: Sequence[FloatArray]) -> ReplayProblem:
-        """The same problem whitened by other standard deviations, one array a target in order."""
-        values = iter(sigma)
-        episodes = tuple(
-            replace(e, targets=tuple(replace(t, sigma=next(values)) for t in e.targets))
-            for e in self.episodes
-        )
-        return ReplayProblem(episodes, self.start)
-
-    def failed(self, residuals: FloatArray) -> BoolArray:
-        """(m,) rows that diverged."""
-        return ~np.isfinite(residuals).all(axis=1)
-
 
 @dataclass(frozen=True, eq=False)
 class Conditional:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -166,10 +166,8 @@ class Replay:
         batch.bind("qpos")[:, index.qpos] = qpos
         batch.bind("qvel")[:, index.dof] = qvel
         laws = [(mod, val) for mod, val in pairs if type(mod).overrides("law")]
-        if laws:
-            states = self._step_through(rig, laws, command, applied)
-        else:
-            states = self._roll_out(rig, command, applied)
+        run = partial(self._step_through, laws=laws) if laws else self._roll_out
+        states = run(rig, command=command, applied=applied)
         position, velocity = at_samples(self.grid, states.position, states.velocity)
         effort = None
         if self.effort:

@@ -14,7 +14,8 @@ from sysid_btr.identify.study import Study
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem
 
-
+CORRELATED = 1.5
+"""Chi2 of a column beyond which its residual is an error of the model rather than noise."""
 CLEAN = 1.02
 """Chi2 of a column below which it counts as explained."""
 
@@ -28,6 +29,7 @@ class Fitted:
     modifiers, values : the model.
     train, holdout : mean square of error over noise floor.
     train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
+    memory : integrated autocorrelation, in samples, of each column's fitted residual; 1 if white.
     train_blocks, holdout_blocks : sums of squares, whitened as fitted, by stretch of half a second.
     evaluations : candidates simulated.
     """
@@ -39,6 +41,7 @@ class Fitted:
     train_columns: FloatArray
     holdout_columns: FloatArray
     columns: FloatArray
+    memory: FloatArray
     train_blocks: FloatArray
     holdout_blocks: FloatArray
     evaluations: int
@@ -46,7 +49,8 @@ class Fitted:
     @property
     def misfit(self) -> float:
         """Sum over columns of the logarithm of held-out chi2: twice the log-likelihood lost a sample where
-        each column's error size is unknown. One bad column cannot drown the others."""
+        each column's error size is unknown. One bad column cannot drown the others.
+        """
         return float(np.sum(np.log(np.maximum(self.holdout_columns, CLEAN))))
 
 
@@ -89,6 +93,7 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
         columns=(train_columns * a + holdout_columns * b) / np.maximum(a + b, 1)
         if same
         else np.concatenate([train_columns, holdout_columns]),
+        memory=_memory(train, r),
         train_blocks=_by_block(train, r),
         holdout_blocks=_by_block(holdout, s),
         evaluations=evaluations + 1,
@@ -98,13 +103,17 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
 def inflate(study: Study, fitted: Fitted) -> Study:
     """The study with each column's noise inflated to the size of the error that a model leaves in it.
 
-    Iterating fits with this is maximum likelihood where every column's error size is unknown.
+    Iterating fits with this is maximum likelihood where every column's error size is unknown, each column
+    counted with as many independent samples as its residual's autocorrelation leaves it (batch means:
+    Geyer 1992, doi:10.1214/ss/1177011137).
     """
     problem = study.train_problem(fitted.modifiers)
     worst: dict[tuple[str, str], float] = {}
-    for chi2, (_, target, k) in zip(fitted.train_columns, problem.columns, strict=True):
+    for chi2, memory, (_, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
         key = (target.channel, target.joints[k])
-        worst[key] = max(worst.get(key, 1.0), float(np.sqrt(chi2)) if np.isfinite(chi2) else 1.0)
+        # noise is white; an error of the model is not, and says as little as its independent samples
+        error = chi2 * memory if chi2 > CORRELATED else chi2
+        worst[key] = max(worst.get(key, 1.0), float(np.sqrt(error)) if np.isfinite(error) else 1.0)
     return replace(study, inflation=worst)
 
 
@@ -122,7 +131,7 @@ def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitt
 
 
 def _counts(problem: ReplayProblem) -> FloatArray:
-    return np.bincount(problem.column_labels, minlength=len(problem.columns)).astype(float)
+    return np.asarray(np.bincount(problem.column_labels, minlength=len(problem.columns)), dtype=np.float64)
 
 
 def _by_column(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
@@ -133,8 +142,24 @@ def _by_column(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     return mean
 
 
+def _memory(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
+    """Integrated autocorrelation of each column's residual, by batch means over half-second stretches."""
+    columns, blocks = problem.column_labels, problem.blocks
+    width = int(blocks.max()) + 1
+    cell = columns * width + blocks
+    size = len(problem.columns) * width
+    count = np.bincount(cell, minlength=size)
+    total = np.bincount(cell, np.nan_to_num(residual), size)
+    square = np.bincount(columns, np.nan_to_num(residual) ** 2, len(problem.columns))
+    means = np.bincount(np.arange(size) // width, total**2 / np.maximum(count, 1), len(problem.columns))
+    live = np.bincount(np.arange(size) // width, count > 0, len(problem.columns))
+    variance = square / np.maximum(_counts(problem), 1)
+    ratio: FloatArray = means / np.maximum(live, 1) / np.maximum(variance, 1e-300)
+    return np.maximum(ratio, 1.0)
+
+
 def _by_block(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
-    return np.bincount(problem.blocks, weights=np.nan_to_num(residual, nan=1e6) ** 2)
+    return np.asarray(np.bincount(problem.blocks, weights=np.nan_to_num(residual, nan=1e6) ** 2))
 
 
 def _bounds(modifiers: tuple[Modifier, ...]) -> tuple[FloatArray, FloatArray]:
