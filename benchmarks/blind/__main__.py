@@ -31,7 +31,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     if options.list:
         for case in _chosen(options):
-            print(f"{case.id:<12}{case.bench.name:<4} {case.spec.motion:<10}{_planted(case.spec.effects) or 'nothing'}")
+            print(
+                f"{case.id:<12}{case.bench.name:<4} {case.spec.motion:<10}{_planted(case.spec.effects) or 'nothing'}"
+            )
         return 0
     if not options.summary:
         _run(options)
@@ -45,7 +47,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--part", choices=(*PARTS, "all"), default="all")
     parser.add_argument("--only", metavar="N,N", help="numbers within the part, from 1; a-b for a range")
     parser.add_argument("--count", type=int, metavar="N", help="stop after N logs")
-    parser.add_argument("--seconds-budget", type=float, metavar="S", help="start no further log after S seconds")
+    parser.add_argument(
+        "--seconds-budget", type=float, metavar="S", help="start no further log after S seconds"
+    )
     parser.add_argument(
         "--series", type=int, default=0, help="another draw of everything, for logs that nobody has tuned on"
     )
@@ -136,9 +140,7 @@ def examine(case: Case, code: str, recipe: str, out: Path, threads: int = 0) -> 
     return _row(case, code, recipe, result, judgement, seconds)
 
 
-def _row(
-    case: Case, code: str, recipe: str, result: dict[str, Any], found: Judgement, seconds: float
-) -> Row:
+def _row(case: Case, code: str, recipe: str, result: dict[str, Any], found: Judgement, seconds: float) -> Row:
     fits = signature_fits(case.spec.effects, result.get("signature"))
     return Row(
         id=case.id,
@@ -153,7 +155,7 @@ def _row(
         effort=int(case.spec.sensors.effort),
         planted=_planted(case.spec.effects),
         verdict=result.get("verdict", ""),
-        named="; ".join(_named(e, case) for e in result.get("effects", ())),
+        named="; ".join(named(e) for e in result.get("effects", ())),
         correct=found.outcome,
         why=found.why,
         amplitude_error=_text(found.amplitude_error),
@@ -189,8 +191,11 @@ def _sizes(parameters: dict[str, Any]) -> str:
     return ",".join(f"{k}={text(v)}" for k, v in parameters.items())
 
 
-def _named(entry: dict[str, Any], case: Case) -> str:
-    sizes = ",".join(f"{p['name'].partition(':')[0].partition('.')[2] or 'size'}={p['value']:.3g}" for p in entry["parameters"][:6])
+def named(entry: dict[str, Any]) -> str:
+    """One effect of a result: name, places, amounts, and what it may be confused with."""
+    labels = [p["name"].partition(":")[0].partition(".")[2] or "size" for p in entry["parameters"]]
+    values = [p["value"] for p in entry["parameters"]]
+    sizes = ",".join(f"{k}={v:.3g}" for k, v in list(zip(labels, values, strict=True))[:6])
     other = f" or {'/'.join(entry['confused_with'])}" if entry["confused_with"] else ""
     return _placed(entry["effect"], entry["where"], sizes) + other
 

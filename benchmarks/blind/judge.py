@@ -29,6 +29,27 @@ class Named:
     confused: frozenset[str]
 
 
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """One name of the truth with all its places; `effects` may have several sizes.
+
+    Attributes
+    ----------
+    name : as in the library.
+    where : all places.
+    effects : as recorded.
+    """
+
+    name: str
+    where: frozenset[str]
+    effects: tuple[Effect, ...]
+
+    def true(self, place: str) -> dict[str, float]:
+        """The amounts at one place, as the library counts them."""
+        own = next((e for e in self.effects if place in e.where), self.effects[0])
+        return TRUE[self.name](own)
+
+
 @dataclass(frozen=True)
 class Context:
     """What decides which effects no log can tell apart.
@@ -43,14 +64,14 @@ class Context:
     free: frozenset[str]
 
 
-Equivalence = Callable[["Effect", Context], bool]
+Equivalence = Callable[[Planted, Context], bool]
 EQUIVALENT: dict[frozenset[str], Equivalence] = {
     # without a second sensor a late command and a late encoder give the same positions
     frozenset({"command_delay", "sensor_delay"}): lambda e, c: not c.effort,
     # a stiff servo turns a torque into an offset; only effort shows which
     frozenset({"constant_force", "encoder_offset"}): lambda e, c: not c.effort,
     # mass is free, so a load on the body is a shift of its centre of mass but for a little inertia
-    frozenset({"payload", "com_offset"}): lambda e, c: set(e.where) <= c.free,
+    frozenset({"payload", "com_offset"}): lambda e, c: e.where <= c.free,
 }
 """Pairs that count as right under the other's name, if the result says that they may be confused."""
 
@@ -87,16 +108,27 @@ def judge(
     names = named_effects(result["effects"])
     inside = all(e.in_library for e in effects)
     if not effects or not inside:
-        outcome, why = _nothing_to_name(result["verdict"], names, expected="" if not effects else effects[0].name)
+        outcome, why = _nothing_to_name(
+            result["verdict"], names, expected="" if not effects else effects[0].name
+        )
         return Judgement(outcome, why, math.nan, 0, 0)
-    outcome, why, matched = _match(result["verdict"], names, effects, context)
+    true = planted_names(effects)
+    outcome, why, matched = _match(result["verdict"], names, true, context)
     errors, hits, told = [], 0, 0
-    for effect in matched:
-        error, k, n = _amounts(effect, result["effects"])
+    for one in matched:
+        error, k, n = _amounts(one, result["effects"])
         errors.append(error)
         hits, told = hits + k, told + n
     known = [e for e in errors if math.isfinite(e)]
     return Judgement(outcome, why, max(known, default=math.nan), hits, told)
+
+
+def planted_names(effects: Sequence[Effect]) -> tuple[Planted, ...]:
+    """The truth, each name once."""
+    own: dict[str, list[Effect]] = {}
+    for effect in effects:
+        own.setdefault(effect.name, []).append(effect)
+    return tuple(Planted(n, frozenset(p for e in es for p in e.where), tuple(es)) for n, es in own.items())
 
 
 def named_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Named, ...]:
@@ -111,20 +143,27 @@ def named_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Named, ...]:
 
 def _nothing_to_name(verdict: str, names: tuple[Named, ...], expected: str) -> tuple[Outcome, str]:
     if names:
-        return "wrong", f"named {', '.join(sorted(n.effect for n in names))} where the library has nothing to name"
+        return (
+            "wrong",
+            f"named {', '.join(sorted(n.effect for n in names))} where the library has nothing to name",
+        )
     if not expected:
-        return ("yes", "") if verdict == "nothing_missing" else ("unexplained", "a residual that is not there")
+        return (
+            ("yes", "") if verdict == "nothing_missing" else ("unexplained", "a residual that is not there")
+        )
     return ("yes", "") if verdict == "unexplained" else ("missed", f"{expected} went unseen")
 
 
 def _match(
-    verdict: str, names: tuple[Named, ...], effects: Sequence[Effect], context: Context
-) -> tuple[Outcome, str, tuple[Effect, ...]]:
+    verdict: str, names: tuple[Named, ...], effects: Sequence[Planted], context: Context
+) -> tuple[Outcome, str, tuple[Planted, ...]]:
     if verdict == "nothing_missing":
         return "missed", "nothing seen", ()
     if not names:
         return "unexplained", "", ()
-    right = {e: next((n for n in names if n.effect == e.name and same_place(e, n.where)), None) for e in effects}
+    right = {
+        e: next((n for n in names if n.effect == e.name and same_place(e, n.where)), None) for e in effects
+    }
     found = tuple(e for e in effects if right[e])
     under = {e: right[e] or _under_another_name(e, names, context) for e in effects}
     extra = [n for n in names if n not in under.values()]
@@ -145,12 +184,13 @@ def _match(
     return "wrong", "; ".join(_wrong(n, effects) for n in extra), found
 
 
-def _wrong(name: Named, effects: Sequence[Effect]) -> str:
+def _wrong(name: Named, effects: Sequence[Planted]) -> str:
     same = any(e.name == name.effect for e in effects)
-    return f"{name.effect} at {'wrong places' if same else 'all'}: {', '.join(sorted(name.where))}"
+    place = ", ".join(sorted(name.where)) if len(name.where) < EVERYWHERE else f"{len(name.where)} places"
+    return f"{name.effect} at {place}, {'other places than planted' if same else 'not planted'}"
 
 
-def _under_another_name(effect: Effect, names: tuple[Named, ...], context: Context) -> Named | None:
+def _under_another_name(effect: Planted, names: tuple[Named, ...], context: Context) -> Named | None:
     for pair, cannot_tell in EQUIVALENT.items():
         if effect.name not in pair or not cannot_tell(effect, context):
             continue
@@ -160,17 +200,17 @@ def _under_another_name(effect: Effect, names: tuple[Named, ...], context: Conte
     return None
 
 
-def _doubts(effect: Effect, name: Named, context: Context) -> frozenset[str]:
+def _doubts(effect: Planted, name: Named, context: Context) -> frozenset[str]:
     """What the name may be confused with, less what no log can tell from it."""
     same = {n for pair, c in EQUIVALENT.items() if effect.name in pair and c(effect, context) for n in pair}
     return name.confused - same - {effect.name}
 
 
-def same_place(effect: Effect, where: frozenset[str]) -> bool:
+def same_place(effect: Planted, where: frozenset[str]) -> bool:
     """Whether an effect was named where it is."""
     if effect.name in ROBOT_WIDE:
         return True
-    true = frozenset(effect.where)
+    true = effect.where
     if len(true) >= EVERYWHERE:
         return where <= true and len(where) >= ALL_BUT * len(true)
     return where == true
@@ -196,7 +236,11 @@ TRUE: dict[str, Callable[[Any], dict[str, float]]] = {
     "coulomb_friction": lambda e: {"torque": e.torque},
     "viscous_damping": lambda e: {"b": e.coefficient},
     "quadratic_damping": lambda e: {"b": e.coefficient},
-    "stribeck_friction": lambda e: {"static": e.static - e.coulomb, "coulomb": e.coulomb, "velocity": e.velocity},
+    "stribeck_friction": lambda e: {
+        "static": e.static - e.coulomb,
+        "coulomb": e.coulomb,
+        "velocity": e.velocity,
+    },
     "load_friction": lambda e: {"ratio": e.coefficient},
     "armature": lambda e: {"inertia": e.inertia},
     "command_delay": lambda e: {"time": e.delay},
@@ -228,25 +272,26 @@ VECTORS = {"com_offset": 3, "cogging": 2, "gravity_tilt": 2}
 """Effects whose size is the length of their first few numbers."""
 
 
-def _amounts(effect: Effect, entries: Sequence[Mapping[str, Any]]) -> tuple[float, int, int]:
+def _amounts(planted_effect: Planted, entries: Sequence[Mapping[str, Any]]) -> tuple[float, int, int]:
     """Worst relative error of the size over places; how many amounts lie in their intervals, of how many."""
-    true = TRUE[effect.name](effect)
-    size = VECTORS.get(effect.name, 1)
-    main = list(true)[:size]
+    name = planted_effect.name
     errors, inside, told = [], 0, 0
     for entry in entries:
-        if entry["effect"] != effect.name:
+        if entry["effect"] != name:
             continue
         by_group: dict[str, dict[str, Mapping[str, Any]]] = {}
         for p in entry["parameters"]:
             label, _, group = p["name"].partition(":")
-            kind = label.partition(".")[2] or next(iter(true))
+            kind = label.partition(".")[2]
             by_group.setdefault(group, {})[kind] = p
-        for found in by_group.values():
+        for group, numbers in by_group.items():
+            # one amount for several places is compared with the first of them
+            true = planted_effect.true(group.partition(",")[0])
+            found = {k or next(iter(true)): p for k, p in numbers.items()}
             known = {k: p for k, p in found.items() if k in true and p["identifiable"] != "no" and _has(p)}
             told += len(known)
             inside += sum(p["ci95"][0] <= true[k] <= p["ci95"][1] for k, p in known.items())
-            own = [k for k in main if k in known]
+            own = [k for k in list(true)[: VECTORS.get(name, 1)] if k in known]
             length = math.hypot(*(true[k] for k in own))
             if length > 0:
                 errors.append(math.hypot(*(known[k]["value"] - true[k] for k in own)) / length)

@@ -81,7 +81,9 @@ def either_sign(rng: Generator, low: float, high: float) -> float:
 def _stribeck(rng: Generator, stage: Stage, where: Names) -> Effect:
     coulomb = rng.uniform(0.05, 0.2)
     static = coulomb + rng.uniform(0.1, 0.3)
-    return planted.StribeckFriction(where=where, coulomb=coulomb, static=static, velocity=rng.uniform(0.1, 0.6))
+    return planted.StribeckFriction(
+        where=where, coulomb=coulomb, static=static, velocity=rng.uniform(0.1, 0.6)
+    )
 
 
 def _speed_torque(rng: Generator, stage: Stage, where: Names) -> Effect:
@@ -174,7 +176,9 @@ LIBRARY: dict[str, Recipe] = {
         effort=True,
     ),
     "backlash": Recipe(
-        lambda r, s, w: planted.Backlash(where=w, play=r.uniform(0.01, 0.05), motor_damping=float(r.integers(2))),
+        lambda r, s, w: planted.Backlash(
+            where=w, play=r.uniform(0.01, 0.05), motor_damping=float(r.integers(2))
+        ),
         ("triangles", "multisine", "poses", "gait"),
     ),
     "joint_compliance": Recipe(
@@ -228,7 +232,9 @@ LIBRARY: dict[str, Recipe] = {
     ),
     "external_disturbance": Recipe(_push, SMOOTH),
     "gravity_tilt": Recipe(
-        lambda r, s, w: planted.GravityTilt(roll=either_sign(r, 0.02, 0.08), pitch=either_sign(r, 0.02, 0.08)),
+        lambda r, s, w: planted.GravityTilt(
+            roll=either_sign(r, 0.02, 0.08), pitch=either_sign(r, 0.02, 0.08)
+        ),
         SMOOTH,
         scope="robot",
     ),
@@ -252,7 +258,9 @@ OUTSIDE: dict[str, Recipe] = {
         scope="two",
     ),
     "random_walk_torque": Recipe(
-        lambda r, s, w: planted.RandomWalkTorque(where=w, size=r.uniform(0.15, 0.4), correlation=r.uniform(0.5, 2.0)),
+        lambda r, s, w: planted.RandomWalkTorque(
+            where=w, size=r.uniform(0.15, 0.4), correlation=r.uniform(0.5, 2.0)
+        ),
         SMOOTH,
     ),
 }

@@ -26,7 +26,9 @@ def summarise(rows: Sequence[Row]) -> str:
     if not rows:
         return "no rows"
     lines = [f"code {', '.join(dict.fromkeys(r.code for r in rows))}", ""]
-    lines.append(f"{'part':<9}{'logs':>5}" + "".join(f"{o:>12}" for o in OUTCOMES) + f"{'mean s':>9}{'max s':>7}")
+    lines.append(
+        f"{'part':<9}{'logs':>5}" + "".join(f"{o:>12}" for o in OUTCOMES) + f"{'mean s':>9}{'max s':>7}"
+    )
     for part in PARTS:
         own = [r for r in rows if r.part == part]
         if not own:
@@ -64,7 +66,7 @@ def _targets(rows: Sequence[Row]) -> list[str]:
         target("single", "one effect: right name and place", count("single", "yes"), 54),
         target("single", "one effect: wrong name or place", count("single", "wrong", "error"), 2, most=True),
         target("pair", "two effects: both named", count("pair", "yes"), 16),
-        target("outside", "outside the library: named all the same", 10 - (10 - _named(rows, "outside")), 0, most=True),
+        target("outside", "outside the library: named all the same", _named(rows, "outside"), 0, most=True),
         target("outside", "outside the library: signature right", fits, 10),
         target("clean", "clean: nothing named", unnamed("clean"), 19),
         target("clean", "clean: held-out chi2 'improved' over 2 %", len(improved), 0, most=True),
@@ -89,7 +91,7 @@ def _amounts(rows: Sequence[Row]) -> list[str]:
     inside, told = (sum(int(r.in_ci95.split("/")[i]) for r in right if r.in_ci95) for i in (0, 1))
     return [
         f"amounts of effects named right: median error {100 * errors[len(errors) // 2]:.1f} %, "
-        f"worst {100 * errors[-1]:.0f} %; truth inside the 95 % interval: {inside} of {told}"
+        f"worst {100 * errors[-1]:.1f} %; truth inside the 95 % interval: {inside} of {told}"
     ]
 
 
@@ -97,7 +99,9 @@ def _confusion(rows: Sequence[Row]) -> list[str]:
     own = [r for r in rows if r.part in ("single", "outside")]
     if not own:
         return []
-    cells = Counter((_names(r.planted)[0], " + ".join(_names(r.named)) or r.verdict or r.correct) for r in own)
+    cells = Counter(
+        (_names(r.planted)[0], " + ".join(_names(r.named)) or r.verdict or r.correct) for r in own
+    )
     lines = ["planted -> named"]
     for effect in dict.fromkeys(_names(r.planted)[0] for r in own):
         found = ", ".join(f"{n} {c}" for (p, n), c in cells.most_common() if p == effect)

@@ -62,6 +62,8 @@ AT_FLOOR = 1.10
 """Held-out chi2 up to which a log shows nothing more: noise floors are known to a few percent."""
 FLOOR_ALL, FLOOR_COLUMN = 1.03, 1.12
 """Chi2 of all columns and of the worst one at which there is nothing to look for."""
+CHANCE = 3.0
+"""Standard deviations of chance that these allow on top: short logs know their floor less well."""
 EVEN_SPREAD = 0.05
 """Relative spread of amounts that are one amount, whatever their standard errors."""
 
@@ -232,14 +234,16 @@ def _try(study: Study, state: _State, hypothesis: Hypothesis) -> Fitted:
 
 def _at_floor(fitted: Fitted) -> bool:
     """Whether neither the whole nor any single column has anything left to explain."""
-    return fitted.holdout <= FLOOR_ALL and float(fitted.columns.max()) <= FLOOR_COLUMN
+    return fitted.holdout <= FLOOR_ALL + CHANCE * fitted.overall_chance and bool(
+        np.all(fitted.columns <= FLOOR_COLUMN + CHANCE * fitted.chance)
+    )
 
 
 def _good_enough(before: Fitted, now: Fitted) -> bool:
     """Whether every column is at the floor, or has lost all but a trace of what it had above it."""
     if len(before.columns) != len(now.columns):
         return False
-    limit = np.maximum(FLOOR_COLUMN, 1 + ENOUGH * (before.columns - 1))
+    limit = np.maximum(FLOOR_COLUMN + CHANCE * now.chance, 1 + ENOUGH * (before.columns - 1))
     return bool(np.all(now.columns <= limit))
 
 
@@ -370,9 +374,10 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
 
 
 def _verdict(before: Fitted, state: _State) -> Verdict:
+    at_floor = AT_FLOOR + CHANCE * before.overall_chance
     if not state.effects:
-        return "nothing_missing" if before.holdout <= AT_FLOOR else "unexplained"
-    if _gain(before, state.fitted) < EXPLAINED and state.fitted.holdout > AT_FLOOR:
+        return "nothing_missing" if before.holdout <= at_floor else "unexplained"
+    if _gain(before, state.fitted) < EXPLAINED and state.fitted.holdout > at_floor:
         return "unexplained"
     return "ambiguous" if any(state.rivals) else "explained"
 

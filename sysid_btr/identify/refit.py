@@ -30,6 +30,7 @@ class Fitted:
     train, holdout : mean square of error over noise floor.
     train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
     memory : integrated autocorrelation, in samples, of each column's fitted residual; 1 if white.
+    chance, overall_chance : standard deviation of `columns` and of `holdout` at the floor, by chance alone.
     train_blocks, holdout_blocks : sums of squares, whitened as fitted, by stretch of half a second.
     evaluations : candidates simulated.
     """
@@ -42,6 +43,8 @@ class Fitted:
     holdout_columns: FloatArray
     columns: FloatArray
     memory: FloatArray
+    chance: FloatArray
+    overall_chance: float
     train_blocks: FloatArray
     holdout_blocks: FloatArray
     evaluations: int
@@ -94,6 +97,8 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
         if same
         else np.concatenate([train_columns, holdout_columns]),
         memory=_memory(train, r),
+        chance=np.sqrt(2 / np.maximum(a + b if same else np.concatenate([a, b]), 1)),
+        overall_chance=float(np.sqrt(2 / max(b.sum(), 1))),
         train_blocks=_by_block(train, r),
         holdout_blocks=_by_block(holdout, s),
         evaluations=evaluations + 1,

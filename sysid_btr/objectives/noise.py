@@ -1,8 +1,8 @@
 """Noise floor of each sensor from the log itself: what no model can explain.
 
 Two estimates, the larger wins. High-frequency content: the motion of a robot is smooth on the scale of a
-few samples, so high-order differences of a sensor hold its white noise alone; the median absolute value
-keeps impacts and reversals out (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521). Quantisation:
+few samples, so high-order differences of a sensor hold its white noise alone; cutting them at a multiple of
+their median keeps impacts and reversals out (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521). Quantisation:
 the smallest step between values, over the square root of 12, for sensors that stand still.
 """
 
@@ -16,9 +16,11 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 
-ORDERS = (2, 3, 4, 5)
+ORDERS = (3, 4, 5)
 """Orders of difference tried; the smallest estimate has the least motion left in it."""
 MAD_TO_STD = 1.4826
+CLIP = 4.0
+"""Differences beyond so many robust standard deviations are impacts or reversals, and are cut to that."""
 MIN_SAMPLES = 30
 
 
@@ -56,10 +58,10 @@ def noise_floor(values: FloatArray) -> NoiseFloor:
         if len(difference) < MIN_SAMPLES // 2:
             continue
         moving = np.abs(difference)
-        robust = MAD_TO_STD * float(np.median(moving)) / gain
-        # a coarse encoder makes most differences zero or one step: the median then says nothing
-        coarse = float(np.sqrt(np.mean(np.minimum(moving, 6 * np.median(moving) + 2 * step) ** 2))) / gain
-        estimates.append(coarse if robust < step / 2 else robust)
+        spread = MAD_TO_STD * float(np.median(moving))
+        # a coarse encoder makes most differences zero or one step: the median alone says nothing
+        most = max(CLIP * spread, 2 * step * gain / sqrt(6))
+        estimates.append(float(np.sqrt(np.mean(np.minimum(moving, most) ** 2))) / gain)
     sigma = min(estimates) if estimates else 0.0
     if sigma <= step / sqrt(12):
         return NoiseFloor(max(step / sqrt(12), 1e-12), "quantisation", step)

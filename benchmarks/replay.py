@@ -1,0 +1,243 @@
+"""`python -m benchmarks.replay`: the replay engine against bare MuJoCo, its threads, and its memory.
+
+Every speed is a ratio whose two sides alternate, chunk by chunk, in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+
+import sysid_btr
+from sysid_btr._typing import FloatArray
+from sysid_btr.identify.study import Study, make_study
+from sysid_btr.io.log import Log
+from sysid_btr.io.parquet import read_log
+from sysid_btr.models.robot import Robot, load_robot
+from sysid_btr.replay.engine import CHUNK, Numerics, Replay
+from sysid_btr.replay.numerics import choose_numerics
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+STARRED = tuple(f"{side}{part}" for side in "RL" for part in ("ShoulderRoll", "HipRoll", "HipPitch", "KneePitch"))
+"""Bodies whose masses the Back-to-Reality paper identifies."""
+MASSES = (f"mass:{','.join(STARRED)}", "kp:*=shared", "kv:*=shared")
+CANDIDATES = 64
+SECONDS = 10.0
+MEMORY_CANDIDATES = 512
+MEMORY_SECONDS = 40.0
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot, one log of it, and how it is replayed."""
+
+    robot: Robot
+    log: Log
+    numerics: Numerics
+
+    def study(self, threads: int) -> Study:
+        return make_study(self.robot, [self.log], numerics=self.numerics, threads=threads)
+
+    def first(self, seconds: float) -> Case:
+        """The same, on the first seconds of the log."""
+        stop = int(np.searchsorted(self.log.time, self.log.time[0] + seconds + 1e-6))
+        return replace(self, log=self.log.window(0, stop))
+
+
+def load_case() -> Case:
+    """gantry_c where the recorded logs are at hand, else the sample Nao; numerics chosen by the convergence check."""
+    folder = Path(os.environ.get("SYSID_BTR_DATA", ROOT.parent / "shared" / "data")) / "nao_gantry"
+    if folder.is_dir():
+        model, path = folder / "nominal.xml", folder / "gantry_c.parquet"
+    else:
+        model, path = ROOT / "sample_logs" / "nao.xml", ROOT / "sample_logs" / "nao_delay.parquet"
+    robot, log = load_robot(str(model)), read_log(path)
+    return Case(robot, log, choose_numerics(robot, log)[0])
+
+
+def machine() -> dict[str, Any]:
+    """What a figure depends on besides the code."""
+    cpu = Path("/proc/cpuinfo")
+    names = [line.partition(":")[2].strip() for line in cpu.read_text().splitlines() if line.startswith("model name")]
+    return {
+        "cpu": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "load_average_1_min": round(os.getloadavg()[0], 2),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "sysid-btr": sysid_btr.__version__,
+        **{name: version(name) for name in ("mujoco", "numpy", "scipy")},
+    }
+
+
+def draw(replay: Replay, count: int) -> FloatArray:
+    """Candidates (count, p) around the nominal values."""
+    rng = np.random.default_rng(SEED)
+    nominal = np.array([p.nominal for p in replay.parameters])
+    return nominal * rng.uniform(0.8, 1.2, (count, len(nominal)))
+
+
+def throughput(case: Case, repeats: int) -> dict[str, Any]:
+    """Replay on one thread, on two, and bare `mj_step` on one; chunk by chunk in turn."""
+    case = case.first(SECONDS)
+    replays = {threads: _replay(case, threads) for threads in (1, 2)}
+    candidates = draw(replays[1], CANDIDATES)
+    chunks = [candidates[i : i + CHUNK] for i in range(0, len(candidates), CHUNK)]
+    runs: dict[str, Callable[[FloatArray], None]] = {
+        "bare": lambda rows: _bare(replays[1], len(rows)),
+        "one": lambda rows: _drain(replays[1], rows),
+        "two": lambda rows: _drain(replays[2], rows),
+    }
+    for run in runs.values():
+        run(candidates[:1])
+    wall: dict[str, list[float]] = {name: [] for name in runs}
+    cpu: dict[str, list[float]] = {name: [] for name in runs}
+    for repeat in range(repeats):
+        for chunk in chunks:
+            # each side goes first as often as the others
+            for name in np.roll(list(runs), repeat).tolist():
+                w, c = perf_counter(), process_time()
+                runs[name](chunk)
+                wall[name].append(perf_counter() - w)
+                cpu[name].append(process_time() - c)
+    steps = len(chunks[0]) * replays[1].grid.steps
+    bare, one, two = (np.array(wall[name]) for name in ("bare", "one", "two"))
+    return {
+        "candidates": CANDIDATES,
+        "seconds": SECONDS,
+        "numerics": str(case.numerics),
+        "repeats": repeats,
+        "steps_per_s": {name: round(steps / min(times)) for name, times in wall.items()},
+        "per_thread_over_bare": {
+            "median": _round(np.median(bare / one)),
+            "best": _round(bare.min() / one.min()),
+            "cpu_time": _round(np.median(np.array(cpu["bare"]) / np.array(cpu["one"]))),
+            "target": 0.9,
+        },
+        "two_threads_over_one": {
+            "median": _round(np.median(one / two)),
+            "best": _round(one.min() / two.min()),
+            "cores_it_got": _round(np.median(np.array(cpu["two"]) / two)),
+            "target": 1.6,
+        },
+    }
+
+
+def memory() -> dict[str, Any]:
+    """Peak resident memory of many long candidates, each way of using them in a process of its own."""
+    result: dict[str, Any] = {
+        "candidates": MEMORY_CANDIDATES,
+        "seconds": MEMORY_SECONDS,
+        "target_mb": 800,
+    }
+    for way in ("nothing", "loss", "chunks"):
+        command = [sys.executable, "-m", "benchmarks.replay", "--measure-memory", way]
+        result[way] = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
+    return result
+
+
+def measure_memory(way: str) -> dict[str, Any]:
+    """Peak memory in MB of this process after one way of replaying."""
+    case = load_case()
+    # the same arrays as with the chosen integrator, at a quarter of the time
+    case = replace(case, numerics=Numerics("implicitfast", case.numerics.timestep))
+    log = _at_least(case.log, MEMORY_SECONDS)
+    study = make_study(case.robot, [log], holdout=[], numerics=case.numerics)
+    problem = study.train_problem(study.declare(MASSES))
+    replay = problem.episodes[0].replay
+    candidates = draw(replay, MEMORY_CANDIDATES)
+    began = perf_counter()
+    if way == "loss":
+        assert np.isfinite(problem.loss(candidates)).all()
+    elif way == "chunks":
+        for _, outputs in replay.chunks(candidates):
+            assert np.isfinite(outputs.position).all()
+    return {
+        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "wall_s": _round(perf_counter() - began),
+        "samples": len(log),
+        "joints": len(replay.index.joints),
+        "numerics": str(case.numerics),
+    }
+
+
+def _at_least(log: Log, seconds: float) -> Log:
+    if log.time[-1] - log.time[0] < seconds - 0.5:
+        raise SystemExit(f"the memory benchmark needs a log of {seconds:g} s; set SYSID_BTR_DATA to the recorded logs")
+    return log.window(0, int(np.searchsorted(log.time, log.time[0] + seconds + 1e-6)))
+
+
+def _replay(case: Case, threads: int) -> Replay:
+    study = case.study(threads)
+    return Replay(case.robot, case.log, study.declare(MASSES), case.numerics, threads=threads)
+
+
+def _drain(replay: Replay, candidates: FloatArray) -> None:
+    for _, outputs in replay.chunks(candidates):
+        assert np.isfinite(outputs.position).all()
+
+
+def _bare(replay: Replay, count: int) -> None:
+    """As many steps of the same model from the same state, controls held: the least that MuJoCo can take."""
+    import mujoco
+
+    model, index = replay.model, replay.index
+    data = mujoco.MjData(model)
+    driven = index.actuator >= 0
+    for _ in range(count):
+        mujoco.mj_resetData(model, data)
+        data.qpos[index.qpos], data.qvel[index.dof] = replay.start
+        data.ctrl[index.actuator[driven]] = replay.grid.command[0, driven]
+        mujoco.mj_step(model, data, replay.grid.steps)
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.3g}")
+
+
+def save(name: str, result: dict[str, Any]) -> None:
+    """Write a result and show it."""
+    text = json.dumps(result, indent=1)
+    path = HERE / "results" / f"{name}.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text + "\n")
+    print(text)
+    print(f"written to {path.relative_to(ROOT)}", file=sys.stderr)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.replay", description=__doc__)
+    parser.add_argument("--repeats", type=int, default=2, help="times that each chunk runs on each side")
+    parser.add_argument("--no-memory", action="store_true", help="speed only")
+    parser.add_argument("--measure-memory", choices=("nothing", "loss", "chunks"), help=argparse.SUPPRESS)
+    options = parser.parse_args(argv)
+    if options.measure_memory:
+        print(json.dumps(measure_memory(options.measure_memory)))
+        return 0
+    case = load_case()
+    result: dict[str, Any] = {"machine": machine(), "seed": SEED, "model": case.robot.name, "log": case.log.meta.robot}
+    result["throughput"] = throughput(case, options.repeats)
+    if not options.no_memory:
+        result["memory"] = memory()
+    save("replay", result)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
