@@ -21,15 +21,15 @@ from sysid_btr.diagnosis.scan import Question, Trace, questions, scan
 from sysid_btr.diagnosis.signature import proposals, signature
 from sysid_btr.diagnosis.words import message_of, sentence_of
 from sysid_btr.effects.base import Effect
-from sysid_btr.effects.library import EFFECTS, select_effects
+from sysid_btr.effects.library import select_effects
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.fit import as_modifiers, fit, numerics_shift
+from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.refit import Fitted, inflate, judge, paired_t, refit, robust_refit, shorten
 from sysid_btr.identify.scores import score
-from sysid_btr.identify.study import Study, nominal_start
+from sysid_btr.identify.study import Study
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import body_names, joint_names, servo_joints
 
@@ -40,6 +40,8 @@ SCAN_SECONDS = 15.0
 """Part of each log that is scanned; the leading hypotheses are refitted on more."""
 REFIT_SECONDS = 20.0
 MAX_ROUNDS = 6
+MAX_REFINEMENTS = 1
+"""Times the step may be halved in the end."""
 REFITS = 7
 """Hypotheses refitted in each round."""
 SIMPLER = 0.06
@@ -155,7 +157,9 @@ def close(
         polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True)
         replays += polished.evaluations
         state = replace(state, fitted=polished)
-    final_estimates, study, state = _estimates(study, state)
+    final_estimates: tuple[Estimate, ...] = first.estimates
+    if state.effects:
+        final_estimates, study, state = _estimates(study, state)
     count = sum(len(m.parameters) for m in declared)
     verdict = _verdict(before, state)
     named = _named(study, state, before, final_estimates[count:], declared) if state.effects else ()
@@ -172,7 +176,7 @@ def close(
         nominal=first.nominal,
         before=first.before,
         after=after,
-        parameters=final_estimates[:count] if state.effects else first.estimates,
+        parameters=final_estimates[:count],
         effects=kept,
         candidates=tuple(sorted(candidates, key=lambda c: -c.explained)),
         steps=tuple(steps),
@@ -354,23 +358,31 @@ def _merge(study: Study, state: _State, declared: tuple[Modifier, ...]) -> _Stat
         values.append(np.median(amounts, axis=0) if even else amounts.ravel())
     modifiers = (*declared, *merged)
     fitted = replace(state.fitted, modifiers=modifiers, values=np.concatenate(values))
-    return _State(fitted, tuple(merged), tuple(confused.values()))
+    # what is in the model beside an effect is not its rival
+    present = {kind.name for kind in pieces}
+    kept = tuple(tuple(name for name in names if name not in present) for names in confused.values())
+    return _State(fitted, tuple(merged), kept)
 
 
 def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study, _State]:
-    """Intervals in the final model, including what the step contributes."""
-    fitted = state.fitted
-    problem = study.train_problem(fitted.modifiers, fitted.values)
-    if not problem.parameters:
-        return (), study, state
-    residual, jacobian = linearise(problem, fitted.values)
-    jacobian = np.nan_to_num(jacobian)
-    shift = numerics_shift(problem, fitted.values, jacobian, residual)
-    return (
-        estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift),
-        study,
-        state,
-    )
+    """Intervals in the final model; the step is halved while it moves an estimate by more than its error."""
+    for refinement in range(MAX_REFINEMENTS + 1):
+        fitted = state.fitted
+        problem = study.train_problem(fitted.modifiers, fitted.values)
+        residual, jacobian = linearise(problem, fitted.values)
+        jacobian = np.nan_to_num(jacobian)
+        shift = numerics_shift(problem, fitted.values, jacobian, residual)
+        found = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift)
+        bare = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks)
+        told = np.array([e.identifiable != "no" for e in bare])
+        worst = np.max(np.abs(shift[told]) / np.maximum([e.std for e in bare], 1e-300)[told], initial=0.0)
+        if worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or refinement == MAX_REFINEMENTS:
+            break
+        study = replace(study, numerics=study.numerics.halved())
+        state = replace(state, fitted=refit(study, fitted.modifiers, fitted.values, iterations=4))
+    values, found, _ = hold_unidentifiable(problem, fitted.values, found)
+    fitted = judge(study, fitted.modifiers, values)
+    return found, study, replace(state, fitted=fitted)
 
 
 def _verdict(before: Fitted, state: _State) -> Verdict:
@@ -413,6 +425,3 @@ def _named(
         )
         column += size
     return tuple(result)
-
-
-__all__ = ["EFFECTS", "as_modifiers", "close", "nominal_start", "usable_effects"]

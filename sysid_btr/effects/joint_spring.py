@@ -24,6 +24,7 @@ class JointSpring(Effect):
         Kind("stiffness", "Nm/rad", 0.0, 0.0, 10.0, 0.1),
         Kind("rest", "rad", 0.0, -3.0, 3.0, 0.1),
     )
+    includes: ClassVar[tuple[str, ...]] = ("constant_force",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("payload", "the same joint angle in another orientation to gravity"),
         ("encoder_scale", "a logged effort"),

@@ -125,7 +125,7 @@ def fit(
         replays += polished.evaluations
         values, jacobian, residual = _at_optimum(problem, polished)
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift)
-    values, found, extra = _hold_unidentifiable(study, problem, values, found, shift)
+    values, found, extra = hold_unidentifiable(problem, values, found)
     return Fit(
         study=study,
         modifiers=modifiers,
@@ -175,14 +175,10 @@ def _at_optimum(problem: ReplayProblem, result: FitResult) -> tuple[FloatArray, 
     return result.x, jacobian, residual
 
 
-def _hold_unidentifiable(
-    study: Study,
-    problem: ReplayProblem,
-    values: FloatArray,
-    found: tuple[Estimate, ...],
-    shift: FloatArray,
+def hold_unidentifiable(
+    problem: ReplayProblem, values: FloatArray, found: tuple[Estimate, ...]
 ) -> tuple[FloatArray, tuple[Estimate, ...], int]:
-    """Hold what the log cannot tell at its nominal value, and refit the rest.
+    """Hold what the log cannot tell at its nominal value, and refit the rest: values, estimates, evaluations.
 
     The intervals of the others stay those of the joint fit, so they still cover whatever value the held
     parameters really have.
