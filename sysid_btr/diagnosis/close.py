@@ -50,6 +50,8 @@ NEAR = 0.15
 """A rival whose misfit is within this of the winner's is confused with it, unless a paired test decides."""
 SETTLED = 0.8
 """Once a hypothesis explains all there is, others are tried only if they promise this fraction of its gain."""
+HOPELESS = 0.5
+"""After three trials, hypotheses that promise less than this fraction of the best are not tried."""
 ENOUGH = 0.004
 """Fraction of a column's excess that may be left: effects have shapes, not only amounts."""
 STEP_GAIN = 0.03
@@ -125,6 +127,8 @@ def close(
         for hypothesis in hypotheses:
             if any(_at_floor(f) and hypothesis.gain < SETTLED * h.gain for h, f in trials):
                 continue  # another one explains all there is, and this one promises much less
+            if len(trials) >= 3 and hypothesis.gain < HOPELESS * hypotheses[0].gain:
+                break
             trials.append((hypothesis, _try(study, state, hypothesis)))
             progress(
                 done=round_number,

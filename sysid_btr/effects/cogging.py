@@ -21,6 +21,7 @@ class Cogging(Effect):
     title: ClassVar[str] = "torque that repeats with the angle"
     held: ClassVar[tuple[str, ...]] = ("number",)
     signed: ClassVar[bool] = True
+    law_acts: ClassVar[tuple[str, ...]] = ()
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("sine", "Nm", 0.0, -5.0, 5.0, 0.05),
         Kind("cosine", "Nm", 0.0, -5.0, 5.0, 0.05),

@@ -20,6 +20,7 @@ class IntegralGain(Effect):
     name: ClassVar[str] = "integral_gain"
     title: ClassVar[str] = "integral action of the servo"
     scope: ClassVar = "servo"
+    law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("ki", "Nm/(rad s)", 0.0, 0.0, 200.0, 1.0),)
     everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (

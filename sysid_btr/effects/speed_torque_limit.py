@@ -20,6 +20,7 @@ class SpeedTorqueLimit(Effect):
     name: ClassVar[str] = "speed_torque_limit"
     title: ClassVar[str] = "torque limit that falls with speed"
     scope: ClassVar = "servo"
+    law_acts: ClassVar[tuple[str, ...]] = ("limit",)
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("stall", "Nm", 100.0, 0.01, 100.0, 0.1),
         Kind("no_load_speed", "rad/s", 100.0, 0.1, 100.0, 0.5),

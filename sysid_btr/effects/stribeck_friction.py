@@ -23,6 +23,7 @@ class StribeckFriction(Effect):
 
     name: ClassVar[str] = "stribeck_friction"
     title: ClassVar[str] = "friction that falls with speed"
+    law_acts: ClassVar[tuple[str, ...]] = ("friction",)
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("coulomb", "Nm", 0.0, 0.0, 10.0, 0.05),
         Kind("static", "Nm", 0.0, 0.0, 10.0, 0.05),

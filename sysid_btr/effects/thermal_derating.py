@@ -20,6 +20,7 @@ class ThermalDerating(Effect):
     name: ClassVar[str] = "thermal_derating"
     title: ClassVar[str] = "loss of torque with heat"
     scope: ClassVar = "servo"
+    law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("alpha", "1/Nm2", 0.0, 0.0, 10.0, 0.1),
         Kind("tau", "s", 10.0, 1.0, 200.0, 5.0),

@@ -21,6 +21,7 @@ class VoltageSag(Effect):
     title: ClassVar[str] = "loss of supply voltage per second"
     scope: ClassVar = "robot"
     variant: ClassVar[str] = "time"
+    law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("rate", "1/s", 0.0, 0.0, 0.05, 0.002),)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("thermal_derating", "a rest in the middle of the log, or a logged temperature"),

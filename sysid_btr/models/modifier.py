@@ -153,6 +153,8 @@ class Modifier:
 
     name: ClassVar[str] = ""
     kinds: ClassVar[tuple[Kind, ...]] = ()
+    law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
+    """What the law may change beside the joint torque: gain and motor torque, friction, limits."""
 
     @property
     def groups(self) -> tuple[str, ...]:

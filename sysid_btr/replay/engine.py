@@ -226,6 +226,7 @@ class Replay:
             (modifier, values, modifier.start_law(rig, values), law_index(index, modifier))
             for modifier, values in laws
         ]
+        acts = frozenset(name for modifier, _ in laws for name in modifier.law_acts)
         inputs = step_inputs(self.log, grid)
         qpos_view, qvel_view, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         qfrc = batch.bind("qfrc_applied")
@@ -243,7 +244,7 @@ class Replay:
             step.inputs = {name: values[k] for name, values in inputs.items()}
             for modifier, values, state, places in memory:
                 modifier.law(step, values, state, places)
-            drive.write(step)
+            drive.write(step, acts)
             if states.effort is not None and slot > 0 and grid.state[slot - 1] == k:
                 states.effort[:, slot - 1] = drive.torque(step, command[:, k], q, v)
             ctrl[:, drive.actuators] = command[:, k][:, drive.driven]
@@ -348,13 +349,18 @@ class _Drive:
         total = step.gain * self._servo(command, qpos, qvel) + step.motor_torque
         return np.clip(total, step.limit_low, step.limit_high)
 
-    def write(self, step: Step) -> None:
+    def write(self, step: Step, acts: frozenset[str]) -> None:
+        """Write what the laws changed; `acts` names what they may have."""
         d = self.driven
-        gain = step.gain[:, d, None]
-        self.gainprm[:, self.actuators] = self.base_gain * gain
-        self.biasprm[:, self.actuators] = self.base_bias * gain
-        self.biasprm[:, self.actuators, 0] += step.motor_torque[:, d] / self.gear
-        self.frictionloss[:, self.rig.index.dof] = np.maximum(self.base_friction + step.friction, 0.0)
+        if "servo" in acts:
+            gain = step.gain[:, d, None]
+            self.gainprm[:, self.actuators] = self.base_gain * gain
+            self.biasprm[:, self.actuators] = self.base_bias * gain
+            self.biasprm[:, self.actuators, 0] += step.motor_torque[:, d] / self.gear
+        if "friction" in acts:
+            self.frictionloss[:, self.rig.index.dof] = np.maximum(self.base_friction + step.friction, 0.0)
+        if "limit" not in acts:
+            return
         # limits are torques at the joint, MuJoCo's are forces before the gear
         limits = np.stack([step.limit_low[:, d], step.limit_high[:, d]], axis=-1)
         force = np.sort(limits / self.gear[..., None], axis=-1)
