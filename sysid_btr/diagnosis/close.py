@@ -111,6 +111,8 @@ def close(
     study = first.study
     declared = first.modifiers
     before = judge(study, declared, first.values, first.replays)
+    study = inflate(study, before)
+    before = judge(study, declared, first.values, first.replays)
     state = _State(before, ())
     steps = [StepRecord((), (), before.train, before.holdout)]
     replays = first.replays
@@ -156,7 +158,7 @@ def close(
         steps.append(StepRecord((), removed, state.fitted.train, state.fitted.holdout))
     if state.effects:
         state = _merge(study, state, declared)
-        study = inflate(study, state.fitted)
+        study = inflate(study, state.fitted, memory=True)
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="final fit")
         polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True)
         replays += polished.evaluations

@@ -15,7 +15,7 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, si
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.intervals import Estimate, estimates
-from sysid_btr.identify.refit import refit, robust_refit
+from sysid_btr.identify.refit import inflate, refit, robust_refit
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
 from sysid_btr.models.modifier import Modifier
@@ -104,6 +104,7 @@ def fit(
         coarse = refit(study, modifiers, problem.start)
         if float(coarse.train_columns.max()) > MISFIT:
             study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
+            study = inflate(study, coarse, memory=True)
         rough = coarse.evaluations
         problem = study.train_problem(modifiers, coarse.values)
     result = estimator.fit(problem, rng=rng, budget=budget or Budget(), journal=journal, progress=progress)

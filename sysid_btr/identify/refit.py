@@ -105,19 +105,20 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
     )
 
 
-def inflate(study: Study, fitted: Fitted) -> Study:
+def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     """The study with each column's noise inflated to the size of the error that a model leaves in it.
 
-    Iterating fits with this is maximum likelihood where every column's error size is unknown, each column
-    counted with as many independent samples as its residual's autocorrelation leaves it (batch means:
-    Geyer 1992, doi:10.1214/ss/1177011137).
+    Iterating fits with this is maximum likelihood where every column's error size is unknown. With `memory`
+    each column counts with as many independent samples as its residual's autocorrelation leaves it (batch
+    means: Geyer 1992, doi:10.1214/ss/1177011137), which is right for estimates under an error that stays, and
+    wrong for finding its cause.
     """
     problem = study.train_problem(fitted.modifiers)
     worst: dict[tuple[str, str], float] = {}
-    for chi2, memory, (_, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
+    for chi2, length, (_, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
         key = (target.channel, target.joints[k])
         # noise is white; an error of the model is not, and says as little as its independent samples
-        error = chi2 * memory if chi2 > CORRELATED else chi2
+        error = chi2 * length if memory and chi2 > CORRELATED else chi2
         worst[key] = max(worst.get(key, 1.0), float(np.sqrt(error)) if np.isfinite(error) else 1.0)
     return replace(study, inflation=worst)
 
