@@ -148,6 +148,16 @@ def close(
         rivals = tuple(
             dict.fromkeys(h.effect.name for h, f in trials if _rivals(state.fitted, winner, (h, f)))
         )
+        # a more general effect takes the place of the special case it includes
+        staying = tuple(
+            e
+            for e in state.effects
+            if e.name not in hypothesis.effect.includes or not set(e.places) <= set(hypothesis.places)
+        )
+        if len(staying) < len(state.effects):
+            fitted = _without(study, state, fitted, staying, hypothesis, declared)
+            keep = [i for i, e in enumerate(state.effects) if e in staying]
+            state = _State(state.fitted, staying, tuple(state.rivals[i] for i in keep))
         study, fitted = robust_refit(study, fitted, 1)
         replays += fitted.evaluations
         state = _State(fitted, (*state.effects, hypothesis.modifier(study.scales)), (*state.rivals, rivals))
@@ -194,6 +204,27 @@ def close(
         replays=replays,
         seconds=perf_counter() - began,
     )
+
+
+def _without(
+    study: Study,
+    state: _State,
+    fitted: Fitted,
+    kept: tuple[Effect, ...],
+    hypothesis: Hypothesis,
+    declared: tuple[Modifier, ...],
+) -> Fitted:
+    """Refit with a new effect, and without those it makes superfluous."""
+    column = sum(len(m.parameters) for m in declared)
+    values = [fitted.values[:column]]
+    for effect in state.effects:
+        size = len(effect.parameters)
+        if effect in kept:
+            values.append(fitted.values[column : column + size])
+        column += size
+    values.append(hypothesis.start)
+    modifiers = (*declared, *kept, hypothesis.modifier(study.scales))
+    return refit(study, modifiers, np.concatenate(values))
 
 
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
@@ -268,6 +299,12 @@ def _choose(
 ) -> tuple[Hypothesis, Fitted] | None:
     """The simplest of the best hypotheses, if held-out data want one at all."""
     sound = [(h, f) for h, f in trials if np.isfinite(f.holdout) and _accepted(before, f)]
+    passing = [(h, f) for h, f in trials if h.effect.passing and _accepted_once(before, f)]
+    if passing:
+        event = min(passing, key=lambda t: t[1].misfit_everywhere)
+        others = [f.misfit_everywhere for h, f in sound if not h.effect.passing]
+        if event[1].misfit_everywhere < min(others, default=np.inf) - SIMPLER:
+            return event
     if not sound:
         return None
     best = min(f.misfit for _, f in sound)
@@ -279,10 +316,19 @@ def _accepted(before: Fitted, after: Fitted) -> bool:
     """Whether the improvement on held-out data is large and not by chance."""
     drop = (before.holdout - after.holdout) / before.holdout
     local = float(np.max((before.holdout_columns - after.holdout_columns) / before.holdout_columns))
-    t = paired_t(after.holdout_blocks, before.holdout_blocks)
+    t = paired_t(
+        np.concatenate([after.train_blocks, after.holdout_blocks]),
+        np.concatenate([before.train_blocks, before.holdout_blocks]),
+    )
     # an effect that acts in few stretches (a limit, a push) has a small t however large it is there
     certain = t > STEP_T or max(drop, local) > STEP_CERTAIN
     return (drop > STEP_GAIN or local > 5 * STEP_GAIN) and certain and after.train < before.train
+
+
+def _accepted_once(before: Fitted, after: Fitted) -> bool:
+    """Whether what happens once, and so cannot be held out, removes enough where it happened."""
+    local = float(np.max((before.train_columns - after.train_columns) / before.train_columns))
+    return bool(np.isfinite(after.holdout)) and local > STEP_CERTAIN and after.holdout < 1.05 * before.holdout
 
 
 def _rivals(
@@ -394,7 +440,7 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
 def _verdict(before: Fitted, state: _State) -> Verdict:
     at_floor = AT_FLOOR + CHANCE * before.overall_chance
     if not state.effects:
-        return "nothing_missing" if before.holdout <= at_floor else "unexplained"
+        return "nothing_missing" if max(before.holdout, before.train) <= at_floor else "unexplained"
     if _gain(before, state.fitted) < EXPLAINED and state.fitted.holdout > at_floor:
         return "unexplained"
     return "ambiguous" if any(state.rivals) else "explained"

@@ -36,6 +36,7 @@ class Effect(Modifier):
     main : kind whose value says how large the effect is.
     steps : amounts the scan tries, in units of the kind's scale; more than one where the response bends.
     everywhere : whether it may well be alike at all places, so that the scan asks for that too.
+    passing : whether it happens at some moment, so that held-out data may hold nothing of it.
     includes : simpler effects that are special cases of this one.
     held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
     """
@@ -51,6 +52,7 @@ class Effect(Modifier):
     held: ClassVar[tuple[str, ...]] = ()
     steps: ClassVar[tuple[float, ...]] = (2.0,)
     everywhere: ClassVar[bool] = False
+    passing: ClassVar[bool] = False
     includes: ClassVar[tuple[str, ...]] = ()
 
     @classmethod

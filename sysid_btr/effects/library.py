@@ -15,7 +15,11 @@ from sysid_btr.effects.constant_force import ConstantForce
 from sysid_btr.effects.coulomb_friction import CoulombFriction
 from sysid_btr.effects.encoder_offset import EncoderOffset, EncoderOffsetInLoop
 from sysid_btr.effects.encoder_scale import EncoderScale, EncoderScaleInLoop
-from sysid_btr.effects.external_disturbance import ExternalDisturbance
+from sysid_btr.effects.external_disturbance import (
+    DriveDisturbanceTrain,
+    ExternalDisturbance,
+    ExternalDisturbanceTrain,
+)
 from sysid_btr.effects.foot_compliance import FootCompliance
 from sysid_btr.effects.foot_friction import FootFriction
 from sysid_btr.effects.gravity_tilt import GravityTilt
@@ -65,6 +69,8 @@ EFFECTS: tuple[type[Effect], ...] = (
     ConstantForce,
     Cogging,
     ExternalDisturbance,
+    ExternalDisturbanceTrain,
+    DriveDisturbanceTrain,
     GravityTilt,
     FootFriction,
     FootCompliance,

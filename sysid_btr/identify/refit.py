@@ -56,6 +56,11 @@ class Fitted:
         """
         return float(np.sum(np.log(np.maximum(self.holdout_columns, CLEAN))))
 
+    @property
+    def misfit_everywhere(self) -> float:
+        """The same over all data, for what happens once and cannot be held out."""
+        return float(np.sum(np.log(np.maximum(self.columns, CLEAN))))
+
 
 def refit(
     study: Study,
