@@ -13,6 +13,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -93,7 +94,7 @@ def draw(replay: Replay, count: int) -> FloatArray:
 
 
 def throughput(case: Case, repeats: int) -> dict[str, Any]:
-    """Replay on one thread, on two, and bare `mj_step` on one; chunk by chunk in turn."""
+    """Replay and bare `mj_step`, on one thread and on two; chunk by chunk in turn."""
     case = case.first(SECONDS)
     replays = {threads: _replay(case, threads) for threads in (1, 2)}
     candidates = draw(replays[1], CANDIDATES)
@@ -102,6 +103,7 @@ def throughput(case: Case, repeats: int) -> dict[str, Any]:
         "bare": lambda rows: _bare(replays[1], len(rows)),
         "one": lambda rows: _drain(replays[1], rows),
         "two": lambda rows: _drain(replays[2], rows),
+        "bare_two": lambda rows: _bare_threads(replays[1], len(rows), 2),
     }
     for run in runs.values():
         run(candidates[:1])
@@ -116,7 +118,7 @@ def throughput(case: Case, repeats: int) -> dict[str, Any]:
                 wall[name].append(perf_counter() - w)
                 cpu[name].append(process_time() - c)
     steps = len(chunks[0]) * replays[1].grid.steps
-    bare, one, two = (np.array(wall[name]) for name in ("bare", "one", "two"))
+    bare, one, two, bare_two = (np.array(wall[name]) for name in ("bare", "one", "two", "bare_two"))
     return {
         "candidates": CANDIDATES,
         "seconds": SECONDS,
@@ -133,6 +135,9 @@ def throughput(case: Case, repeats: int) -> dict[str, Any]:
             "median": _round(np.median(one / two)),
             "best": _round(one.min() / two.min()),
             "cores_it_got": _round(np.median(np.array(cpu["two"]) / two)),
+            "bare_median": _round(np.median(bare / bare_two)),
+            "bare_cores_it_got": _round(np.median(np.array(cpu["bare_two"]) / bare_two)),
+            "extra_cpu_time": _round(np.median(np.array(cpu["two"]) / np.array(cpu["one"])) - 1),
             "target": 1.6,
         },
     }
@@ -204,6 +209,12 @@ def _bare(replay: Replay, count: int) -> None:
         data.qpos[index.qpos], data.qvel[index.dof] = replay.start
         data.ctrl[index.actuator[driven]] = replay.grid.command[0, driven]
         mujoco.mj_step(model, data, replay.grid.steps)
+
+
+def _bare_threads(replay: Replay, count: int, threads: int) -> None:
+    """The same on several threads: what the machine, busy as it is, gives at that moment."""
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda _: _bare(replay, 1), range(count)))
 
 
 def _round(value: float) -> float:

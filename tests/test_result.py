@@ -21,7 +21,8 @@ from sysid_btr.models.robot import load_robot
 from sysid_btr.replay.engine import Numerics
 from sysid_btr.report.html import render
 from sysid_btr.report.text import console, show
-from sysid_btr.result import clean, exit_code, make_result, read_result, si, si_all, to_json, with_digits_of
+from sysid_btr.result import clean, exit_code, make_result, read_result, to_json
+from sysid_btr.units import si, si_all, with_digits_of
 
 PROMISED = {
     "schema",

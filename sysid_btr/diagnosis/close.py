@@ -50,6 +50,8 @@ NEAR = 0.15
 """A rival whose misfit is within this of the winner's is confused with it, unless a paired test decides."""
 SETTLED = 0.8
 """Once a hypothesis explains all there is, others are tried only if they promise this fraction of its gain."""
+MOST_THINNED, SMALL = 10, 0.5
+"""Groups up to this size are thinned; an amount below this fraction of the largest is doubted."""
 HOPELESS = 0.5
 """After three trials, hypotheses that promise less than this fraction of the best are not tried."""
 ENOUGH = 0.004
@@ -145,6 +147,8 @@ def close(
         if winner is None:
             break
         hypothesis, fitted = winner
+        hypothesis, fitted, spent = _thin(study, state, hypothesis, fitted)
+        replays += spent
         rivals = tuple(
             dict.fromkeys(h.effect.name for h, f in trials if _rivals(state.fitted, winner, (h, f)))
         )
@@ -184,10 +188,11 @@ def close(
     if verdict == "unexplained":
         left = signature(study, state.fitted.modifiers, state.fitted.values)
     after = score(study, state.fitted.modifiers, state.fitted.values)
+    unit = "m" if all(s.slide for s in study.scales.values()) else "rad"
     return Closing(
         study=study,
         verdict=verdict,
-        message=message_of(verdict, kept, first.before, after, left),
+        message=message_of(verdict, kept, first.before, after, left, unit),
         noise_floor={c: s.floor for c, s in first.before.holdout.items()},
         nominal=first.nominal,
         before=first.before,
@@ -266,9 +271,11 @@ def _scan(
     return scan(problem, state.fitted.values, residual, jacobian, asked, study.scales), residual
 
 
-def _try(study: Study, state: _State, hypothesis: Hypothesis) -> Fitted:
+def _try(
+    study: Study, state: _State, hypothesis: Hypothesis, values: FloatArray | None = None
+) -> Fitted:
     modifiers = (*state.fitted.modifiers, hypothesis.modifier(study.scales))
-    start = np.concatenate([state.fitted.values, hypothesis.start])
+    start = np.concatenate([state.fitted.values if values is None else values, hypothesis.start])
     found = refit(shorten(study, REFIT_SECONDS), modifiers, start)
     return judge(study, modifiers, found.values, found.evaluations)
 
@@ -286,6 +293,34 @@ def _good_enough(before: Fitted, now: Fitted) -> bool:
         return False
     limit = np.maximum(FLOOR_COLUMN + CHANCE * now.chance, 1 + ENOUGH * (before.columns - 1))
     return bool(np.all(now.columns <= limit))
+
+
+def _thin(
+    study: Study, state: _State, hypothesis: Hypothesis, fitted: Fitted
+) -> tuple[Hypothesis, Fitted, int]:
+    """Drop places of a group whose small amounts held-out data do not miss."""
+    spent = 0
+    kinds = len(hypothesis.effect.kinds)
+    neutral = np.array([k.nominal for k in hypothesis.effect.kinds])
+    waiting = True
+    while waiting and not hypothesis.shared and 1 < len(hypothesis.places) <= MOST_THINNED:
+        waiting = False
+        amounts = fitted.values[-hypothesis.size :].reshape(-1, kinds)
+        size = np.linalg.norm((amounts - neutral) / [max(abs(k.scale), 1e-12) for k in hypothesis.effect.kinds], axis=1)
+        least = int(np.argmin(size))
+        if size[least] > SMALL * size.max():
+            break
+        rest = np.delete(np.arange(len(size)), least)
+        smaller = replace(
+            hypothesis,
+            places=tuple(hypothesis.places[i] for i in rest),
+            start=amounts[rest].ravel(),
+        )
+        trial = _try(study, state, smaller, fitted.values[: -hypothesis.size])
+        spent += trial.evaluations
+        if trial.misfit <= fitted.misfit + SIMPLER:
+            hypothesis, fitted, waiting = smaller, trial, True
+    return hypothesis, fitted, spent
 
 
 def _gain(before: Fitted, after: Fitted) -> float:

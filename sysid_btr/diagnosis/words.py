@@ -9,6 +9,7 @@ from sysid_btr.diagnosis.closing import NamedEffect, Verdict
 from sysid_btr.effects.base import Effect
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import Scores
+from sysid_btr.units import si_all
 
 
 def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
@@ -38,15 +39,16 @@ def message_of(
     before: Scores,
     after: Scores,
     left: Mapping[str, Any] | None,
+    unit: str = "rad",
 ) -> str:
     """The verdict in one sentence, with the held-out error before and after."""
     channel = "position"
     errors = ""
     if channel in before.holdout and channel in after.holdout:
-        errors = (
-            f" Held-out {channel} error {before.holdout[channel].rmse:.3g} -> {after.holdout[channel].rmse:.3g} "
-            f"(noise floor {before.holdout[channel].floor:.3g})."
+        old, new, floor = si_all(
+            [before.holdout[channel].rmse, after.holdout[channel].rmse, before.holdout[channel].floor], unit
         )
+        errors = f" Held-out {channel} error {old} -> {new} (noise floor {floor})."
     if verdict == "nothing_missing":
         return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
     if verdict == "unexplained":

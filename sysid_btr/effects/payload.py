@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     import mujoco
 
 
+ARM = 0.05
+"""Distance, m, of a load whose mass a scan cannot tell from its place."""
+
+
 @dataclass(frozen=True)
 class Payload(Effect):
     """Native: the body's mass, centre of mass and inertia are those of body and load together.
@@ -49,7 +53,13 @@ class Payload(Effect):
         """The probe's directions are equal loads at several places: amounts add, places average."""
         total = float(np.sum(amounts))
         if total <= 0.05 * float(np.sum(np.abs(amounts))):
-            return None
+            # the mass is hardly told: begin from one that has the moment at a hand's breadth
+            moment = np.dot(amounts, [[d[0] * x for x in d[1:]] for d in probe])
+            size = float(np.linalg.norm(moment))
+            if size == 0:
+                return None
+            mass = size / ARM
+            return np.array([min(mass, cls.kinds[0].upper), *(moment / mass)])
         kinds = cls.sized(scale)
         values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
         values[0] *= total

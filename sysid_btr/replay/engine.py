@@ -191,7 +191,7 @@ class Replay:
         import mujoco
 
         batch, index, keep = rig.batch, self.index, self.grid.state
-        states = _States.empty(rig.size, len(keep), len(index.joints))
+        states = _States.empty(rig.size, len(keep), index)
         states.store(batch, index, 0, self.grid)
         spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
         nu, nv = self.model.nu, self.model.nv
@@ -220,7 +220,7 @@ class Replay:
         """Step by step, for laws that MuJoCo cannot hold; all candidates of the chunk at once."""
         batch, index, grid = rig.batch, self.index, self.grid
         h = grid.timestep
-        states = _States.empty(rig.size, len(grid.state), len(index.joints), effort=self.effort)
+        states = _States.empty(rig.size, len(grid.state), index, effort=self.effort)
         drive = _Drive(rig)
         memory = [
             (modifier, values, modifier.start_law(rig, values), law_index(index, modifier))
@@ -268,19 +268,22 @@ class _States:
     effort: FloatArray | None = None
 
     @classmethod
-    def empty(cls, m: int, kept: int, joints: int, *, effort: bool = False) -> _States:
+    def empty(cls, m: int, kept: int, index: Index, *, effort: bool = False) -> _States:
         def new() -> FloatArray:
-            return np.empty((m, kept, joints))
+            return np.empty((m, kept, len(index.joints)))
 
-        return cls(new(), new(), new(), new(), new() if effort else None)
+        motor, motor_velocity = new(), new()
+        # without a link side, the sensor sees the motor side
+        position, velocity = (new(), new()) if (index.link_qpos >= 0).any() else (motor, motor_velocity)
+        return cls(position, velocity, motor, motor_velocity, new() if effort else None)
 
     def put(self, index: Index, slots: IntArray, qpos: FloatArray, qvel: FloatArray) -> None:
         self.motor[:, slots] = qpos[:, :, index.qpos]
         self.motor_velocity[:, slots] = qvel[:, :, index.dof]
-        self.position[:, slots] = self.motor[:, slots]
-        self.velocity[:, slots] = self.motor_velocity[:, slots]
         linked = np.flatnonzero(index.link_qpos >= 0)
         if len(linked):
+            self.position[:, slots] = self.motor[:, slots]
+            self.velocity[:, slots] = self.motor_velocity[:, slots]
             self.position[:, slots[:, None], linked] += qpos[:, :, index.link_qpos[linked]]
             self.velocity[:, slots[:, None], linked] += qvel[:, :, index.link_dof[linked]]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.result import si_all
+from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

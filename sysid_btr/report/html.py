@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.report.text import compact, number, stages, told
-from sysid_btr.result import si, si_all, with_digits_of
+from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
     from jinja2 import Template

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
-from sysid_btr.result import si_all, with_digits_of
+from sysid_btr.units import si_all, with_digits_of
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType

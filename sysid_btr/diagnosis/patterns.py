@@ -1,0 +1,240 @@
+"""Patterns in a signal: pulses, what repeats with time or angle, and what a state explains of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+
+GROW = 1.25
+"""Ratio of neighbouring pulse lengths that are tried."""
+FOLDS = 5
+BINS = 40
+"""Bins of one period when a signal is folded."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A rectangular pulse on a constant: samples [start, stop), height over the rest, share of the variance."""
+
+    start: int
+    stop: int
+    height: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Train:
+    """Equal rectangular pulses at regular intervals: s, and the share of the variance they explain."""
+
+    start: float
+    duration: float
+    period: float
+    height: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """A spatial frequency, rad per unit of position, and the share of the variance it explains."""
+
+    number: float
+    share: float
+
+
+def best_box(signal: FloatArray, shortest: int) -> Box | None:
+    """The pulse that explains most of a signal in the sense of least squares."""
+    n = len(signal)
+    total = float(np.sum((signal - signal.mean()) ** 2))
+    if n < 8 * shortest or total == 0:
+        return None
+    sums = np.concatenate([[0.0], np.cumsum(signal - signal.mean())])
+
+    def gains(a: FloatArray, b: FloatArray) -> FloatArray:
+        length = np.maximum(b - a, 1)
+        return np.where(b > a, (sums[b] - sums[a]) ** 2 * n / (length * np.maximum(n - length, 1)), 0.0)
+
+    best, at = 0.0, (0, 1)
+    length = float(max(shortest, 1))
+    while length < n / 3:
+        whole = round(length)
+        a = np.arange(n - whole + 1)
+        gain = gains(a, a + whole)
+        k = int(np.argmax(gain))
+        if gain[k] > best:
+            best, at = float(gain[k]), (k, k + whole)
+        length = max(length * GROW, length + 1)
+    reach = max((at[1] - at[0]) // 3, 2)
+    near_start = np.clip(np.arange(at[0] - reach, at[0] + reach + 1), 0, n - 1)
+    near_stop = np.clip(np.arange(at[1] - reach, at[1] + reach + 1), 1, n)
+    grid = gains(*np.meshgrid(near_start, near_stop, indexing="ij"))
+    i, k = np.unravel_index(int(np.argmax(grid)), grid.shape)
+    start, stop = int(near_start[i]), int(near_stop[k])
+    height = (sums[stop] - sums[start]) / (stop - start) * n / (n - (stop - start))
+    return Box(start, stop, float(height), float(grid[i, k]) / total)
+
+
+def fold(signal: FloatArray, time: FloatArray, period: float, bins: int = BINS) -> tuple[FloatArray, FloatArray]:
+    """Mean of a signal over its phase in a period, and how many samples each mean has; (bins,) each."""
+    label = (np.mod(time / period, 1.0) * bins).astype(np.int64) % bins
+    count = np.bincount(label, minlength=bins)
+    mean = np.bincount(label, signal, bins) / np.maximum(count, 1)
+    return mean, count.astype(float)
+
+
+def repetition(signal: FloatArray, time: FloatArray, period: float) -> float:
+    """Share of a signal's variance that repeats with a period, corrected for the number of bins."""
+    n, bins = len(signal), int(min(BINS, max(period / (time[1] - time[0]), 2)))
+    mean, count = fold(signal - signal.mean(), time, period, bins)
+    total = float(np.sum((signal - signal.mean()) ** 2))
+    share = float(np.sum(count * mean**2)) / max(total, 1e-300)
+    return 1 - (1 - share) * (n - 1) / max(n - bins, 1)
+
+
+def best_period(signal: FloatArray, time: FloatArray, shortest: float) -> tuple[float, float]:
+    """The period that explains most of a signal by folding, not its multiples, and the share it explains."""
+    duration = time[-1] - time[0]
+    longest = duration / 3
+    if longest <= shortest:
+        return 0.0, 0.0
+    # neighbouring periods drift apart by a bin over the whole signal
+    count = int(BINS * duration / 2 * (1 / shortest - 1 / longest)) + 2
+    periods = 1 / np.linspace(1 / shortest, 1 / longest, min(count, 6000))
+    shares = np.array([repetition(signal, time, p) for p in periods])
+    best = int(np.argmax(shares))
+    enough = np.flatnonzero((shares >= 0.9 * shares[best]) & (periods <= 1.02 * periods[best]))
+    if shares[best] <= 0 or len(enough) == 0:
+        return 0.0, 0.0
+    # the shortest period that does nearly as well; a multiple of it only adds noise
+    group = enough[periods[enough] <= 1.05 * periods[enough].min()]
+    at = int(group[np.argmax(shares[group])])
+    return float(periods[at]), float(shares[at])
+
+
+def best_train(signal: FloatArray, time: FloatArray, period: float) -> Train:
+    """The pulse train of about this period that explains most of a signal."""
+    step = float(time[1] - time[0])
+    bins = int(np.clip(period / step, 4, 400))
+    mean, count = fold(signal - signal.mean(), time, period, bins)
+    start, length = _circular_box(mean * count, count)
+    train = np.array([start / bins * period, length / bins * period, period])
+    span = time[-1] - time[0]
+    scale = np.array([period / bins, period / bins, period / bins * period / span])
+    best = _explained(signal, time, train)
+    for _ in range(5):
+        for i in range(3):
+            trials = np.tile(train, (13, 1))
+            trials[:, i] += np.linspace(-1.5, 1.5, 13) * scale[i]
+            trials[:, 1:] = np.maximum(trials[:, 1:], step)
+            shares = [_explained(signal, time, trial)[0] for trial in trials]
+            k = int(np.argmax(shares))
+            if shares[k] > best[0]:
+                train, best = trials[k], _explained(signal, time, trials[k])
+        scale *= 0.5
+    first = float(np.mod(train[0], train[2]))
+    return Train(first, float(train[1]), float(train[2]), best[1], best[0])
+
+
+def _circular_box(sums: FloatArray, count: FloatArray) -> tuple[int, int]:
+    """Start and length of the stretch of a circle that differs most from the rest."""
+    bins, n = len(sums), count.sum()
+    s = np.concatenate([[0.0], np.cumsum(np.tile(sums, 2))])
+    c = np.concatenate([[0.0], np.cumsum(np.tile(count, 2))])
+    best, at = -1.0, (0, 1)
+    for length in range(1, bins // 2 + 1):
+        inside = s[length : bins + length] - s[:bins]
+        size = c[length : bins + length] - c[:bins]
+        gain = inside**2 * n / np.maximum(size * (n - size), 1)
+        k = int(np.argmax(gain))
+        if gain[k] > best:
+            best, at = float(gain[k]), (k, length)
+    return at
+
+
+def _explained(signal: FloatArray, time: FloatArray, train: FloatArray) -> tuple[float, float]:
+    """Share of the variance that a train (start, duration, period) explains, and its height."""
+    on = np.mod(time - train[0], train[2]) < train[1]
+    inside = int(on.sum())
+    if inside in (0, len(on)):
+        return 0.0, 0.0
+    height = float(signal[on].mean() - signal[~on].mean())
+    total = float(np.sum((signal - signal.mean()) ** 2))
+    share = height**2 * inside * (len(on) - inside) / len(on) / max(total, 1e-300)
+    return share, height
+
+
+def hats(x: FloatArray, knots: FloatArray) -> FloatArray:
+    """Piecewise linear functions of x that are 1 at one knot each, (n, knots)."""
+    return np.column_stack([np.interp(x, knots, unit) for unit in np.eye(len(knots))])
+
+
+def even_knots(x: FloatArray, most: int) -> FloatArray:
+    """Knots at quantiles, so that every hat has data."""
+    knots = np.unique(np.quantile(x, np.linspace(0, 1, most)))
+    return knots if len(knots) > 1 else np.array([x.min(), x.min() + 1.0])
+
+
+def predicted_share(signal: FloatArray, design: FloatArray, block: int) -> float:
+    """Share of a signal's variance that a linear model predicts on stretches it was not fitted to.
+
+    Parameters
+    ----------
+    signal : (n,).
+    design : (n, k); a constant is added.
+    block : samples in a stretch; every fifth one is predicted from the others.
+    """
+    n = len(signal)
+    x = np.column_stack([np.ones(n), design])
+    size = np.sqrt(np.mean(x**2, axis=0))
+    x = x / np.where(size > 0, size, 1.0)
+    fold_of = (np.arange(n) // max(block, 1) * 2) % FOLDS
+    grams = [x[fold_of == f].T @ x[fold_of == f] for f in range(FOLDS)]
+    inner = [x[fold_of == f].T @ signal[fold_of == f] for f in range(FOLDS)]
+    gram, target = sum(grams), sum(inner)
+    ridge = 1e-4 * n * np.eye(x.shape[1])
+    left = total = 0.0
+    for f in range(FOLDS):
+        test = fold_of == f
+        if not test.any() or test.all():
+            continue
+        weights = np.linalg.solve(gram - grams[f] + ridge, target - inner[f])
+        left += float(np.sum((signal[test] - x[test] @ weights) ** 2))
+        total += float(np.sum((signal[test] - signal[~test].mean()) ** 2))
+    return 1 - left / total if total > 0 else 0.0
+
+
+def without(signal: FloatArray, design: FloatArray) -> FloatArray:
+    """What a linear model and a constant leave of a signal, or of signals (n, k)."""
+    x = np.column_stack([np.ones(len(design)), design])
+    size = np.linalg.norm(x, axis=0)
+    x = x / np.where(size > 0, size, 1.0)
+    return np.asarray(signal - x @ np.linalg.lstsq(x, signal, rcond=1e-8)[0])
+
+
+def line_shares(signal: FloatArray, sines: Sequence[FloatArray], design: FloatArray) -> FloatArray:
+    """Share of a signal's variance that each pair of columns explains beyond a design."""
+    base = without(signal, design)
+    total = float(base @ base)
+    shares = []
+    for pair in sines:
+        rest = without(pair, design)
+        gram = rest.T @ rest + 1e-9 * float(np.sum(pair**2)) * np.eye(pair.shape[1])
+        inner = rest.T @ base
+        shares.append(float(inner @ np.linalg.solve(gram, inner)) / max(total, 1e-300))
+    return np.array(shares)
+
+
+def memory(signal: FloatArray) -> float:
+    """Samples over which a signal resembles itself: the sum of its autocorrelation to the first zero."""
+    n = len(signal)
+    spectrum = np.abs(np.fft.rfft(signal - signal.mean(), 2 * n)) ** 2
+    correlation = np.fft.irfft(spectrum)[: n // 2]
+    if correlation[0] <= 0:
+        return 1.0
+    correlation = correlation / correlation[0]
+    below = np.flatnonzero(correlation <= 0)
+    end = int(below[0]) if len(below) else len(correlation)
+    return float(1 + 2 * np.sum(correlation[1:end]))

@@ -1,0 +1,290 @@
+"""The torque that is missing: from what a replay leaves of the measured positions to torques at the joints.
+
+A small torque pulse at each joint, simulated, gives the impulse responses of a limb; Wiener deconvolution
+with them turns position errors into the disturbance torques that would explain them (Wiener 1949,
+"Extrapolation, Interpolation, and Smoothing of Stationary Time Series"). Joints of one limb push each other,
+so a limb is inverted as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.effects.base import scale_at
+from sysid_btr.effects.external_disturbance import ExternalDisturbanceTrain
+from sysid_btr.models.scales import Scales
+from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.targets import WARM_UP, Target
+from sysid_btr.replay.structure import limbs
+
+MOST_SAMPLES = 16384
+"""Longer episodes are averaged down to this many samples."""
+LINEAR = 0.02
+"""Relative error of a linear response: this fraction of a residual counts as noise on top of the sensor's."""
+LONGEST_MEMORY = 2.0
+"""Seconds after which a response is taken to be over."""
+PULSES = 5
+"""Pulses whose responses are averaged, at least."""
+EDGE = 0.1
+"""Seconds before the end of an episode whose torque shows too late to be known."""
+ITERATIONS = 4
+"""Of the estimate of how large the torques are."""
+
+
+@dataclass(frozen=True, eq=False)
+class MissingTorque:
+    """Torque that would explain the position error of one joint in one episode, and what went with it.
+
+    Attributes
+    ----------
+    joint, episode : where.
+    unit : of the torque.
+    period : (s) of the uniform grid.
+    time : (n,) s since the first sample.
+    torque : (n,) Nm or N; smoothed to what the sensor can resolve.
+    noise : standard deviation of what sensor noise makes of it.
+    residual : (n,) position error in noise floors.
+    chi2 : its mean square; 1 at the noise floor.
+    position, velocity, acceleration : (n,) position as measured, derivatives as replayed.
+    command, servo : (n,) command and torque of the servo.
+    frequency, gain : (f,) Hz and fraction of a torque at that frequency that `torque` shows.
+    """
+
+    joint: str
+    episode: int
+    unit: str
+    period: float
+    time: FloatArray
+    torque: FloatArray
+    noise: float
+    residual: FloatArray
+    chi2: float
+    position: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    command: FloatArray
+    servo: FloatArray
+    frequency: FloatArray
+    gain: FloatArray
+
+    def seen(self, columns: FloatArray) -> FloatArray:
+        """Torques (n, k) or (n,) as this estimate would show them, without noise."""
+        mirrored = np.concatenate([columns, columns[::-1]])
+        spectrum = np.fft.rfft(mirrored, axis=0)
+        at = np.fft.rfftfreq(len(mirrored), self.period)
+        gain = np.interp(at, self.frequency, self.gain)
+        spectrum *= gain if columns.ndim == 1 else gain[:, None]
+        return np.asarray(np.fft.irfft(spectrum, len(mirrored), axis=0)[: len(columns)])
+
+
+def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) -> tuple[MissingTorque, ...]:
+    """Deconvolve the position errors of a problem into torques, every measured joint of every episode.
+
+    Parameters
+    ----------
+    problem : data and modifiers.
+    values : (p,) of the modifiers.
+    scales : sizes at the joints.
+
+    Returns
+    -------
+    tuple of MissingTorque
+        Empty where the replay diverges.
+    """
+    result: list[MissingTorque] = []
+    for i, episode in enumerate(problem.episodes):
+        target = next((t for t in episode.targets if t.channel == "position"), None)
+        if target is not None:
+            result += _deconvolve(i, episode, target, values, scales)
+    return tuple(result)
+
+
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """A uniform grid over the samples of a log, a few of which are averaged into one."""
+
+    time: FloatArray
+    fine: float
+    together: int
+
+    @classmethod
+    def over(cls, time: FloatArray) -> _Clock:
+        fine = float(np.median(np.diff(time)))
+        samples = int(np.floor((time[-1] - time[0]) / fine + 1e-6)) + 1
+        return cls(time - time[0], fine, -(-samples // MOST_SAMPLES))
+
+    @property
+    def period(self) -> float:
+        return self.fine * self.together
+
+    def uniform(self, values: FloatArray) -> FloatArray:
+        """Values (samples, k) on the grid, (n, k); missing ones are interpolated."""
+        samples = int(np.floor(self.time[-1] / self.fine + 1e-6)) + 1
+        grid = np.arange(samples) * self.fine
+        columns = []
+        for column in values.T:
+            known = np.isfinite(column)
+            columns.append(np.interp(grid, self.time[known], column[known]))
+        fine = np.column_stack(columns)
+        whole = samples // self.together * self.together
+        return np.asarray(fine[:whole].reshape(-1, self.together, fine.shape[1]).mean(axis=1))
+
+
+def _deconvolve(
+    number: int, episode: Episode, target: Target, values: FloatArray, scales: Scales
+) -> list[MissingTorque]:
+    log = episode.replay.log
+    clock = _Clock.over(log.time)
+    joints = target.joints
+    where = limbs(episode.replay.model)
+    members: dict[int, list[int]] = {}
+    for k, joint in enumerate(joints):
+        members.setdefault(where[joint], []).append(k)
+    spacing = min(LONGEST_MEMORY, clock.time[-1] / (PULSES + 1))
+    memory = int(spacing / clock.period)
+    if memory < 4:
+        return []
+    sizes = np.array([scale_at(scales, j).torque_peak for j in joints])
+    depth = max(len(m) for m in members.values())
+    train = ExternalDisturbanceTrain.at(joints, scales)
+    width = max(clock.period, episode.replay.numerics.timestep)
+    rest = np.tile([0.0, clock.period * memory, width, clock.period * memory], (len(joints), 1))
+    amounts = np.zeros((1 + depth, len(joints)))
+    for own in members.values():
+        for row, k in enumerate(own, start=1):
+            amounts[row, k] = sizes[k]
+    pulses = np.tile(rest, (1 + depth, 1, 1))
+    pulses[:, :, 0] = amounts
+    candidates = np.hstack([np.tile(values, (1 + depth, 1)), pulses.reshape(1 + depth, -1)])
+    replay = replace(episode.replay, modifiers=(*episode.replay.modifiers, train), effort=True)
+    outputs = replay.predict(candidates)
+    predicted = outputs.position[:, :, target.columns]
+    if not np.isfinite(predicted).all() or outputs.effort is None:
+        return []
+    error = clock.uniform(target.measured - predicted[0])
+    # response of every joint to every joint of its limb, per unit torque over one sample
+    moved = [clock.uniform(p - predicted[0]) for p in predicted[1:]]
+    torque = np.empty_like(error)
+    noise = np.empty(len(joints))
+    gains: dict[int, FloatArray] = {}
+    frequency = np.zeros(0)
+    for own in members.values():
+        response = np.empty((memory, len(own), len(own)))
+        for row, k in enumerate(own):
+            response[:, :, row] = _impulse(moved[row][:, own], memory) / (sizes[k] * width / clock.period)
+        floor = target.noise[own] / np.sqrt(clock.together)
+        found = _wiener(error[:, own], response, floor)
+        torque[:, own], noise[own] = found.torque, found.noise
+        frequency = found.frequency / clock.period
+        gains.update({k: found.gain[:, i] for i, k in enumerate(own)})
+    keep = slice(int(min(WARM_UP, 0.1 * clock.time[-1]) / clock.period), len(error) - int(EDGE / clock.period))
+    columns = target.columns
+    states = {
+        "position": clock.uniform(np.where(np.isfinite(target.measured), target.measured, predicted[0])),
+        "velocity": clock.uniform(outputs.velocity[0][:, columns]),
+        "servo": clock.uniform(outputs.effort[0][:, columns]),
+        "predicted": clock.uniform(predicted[0]),
+        "command": clock.uniform(_commands(episode, columns)),
+    }
+    acceleration = np.gradient(states["velocity"], clock.period, axis=0)
+    white = (target.measured - predicted[0]) / target.noise
+    chi2 = np.array([np.mean(np.square(white[target.mask[:, k], k])) for k in range(len(joints))])
+    return [
+        MissingTorque(
+            joint=joint,
+            episode=number,
+            unit=scale_at(scales, joint).unit("Nm"),
+            period=clock.period,
+            time=(np.arange(len(error)) * clock.period + 0.5 * (clock.together - 1) * clock.fine)[keep],
+            torque=torque[keep, k],
+            noise=float(noise[k]),
+            residual=(error[:, k] / target.noise[k])[keep],
+            chi2=float(chi2[k]),
+            position=states["position"][keep, k],
+            velocity=states["velocity"][keep, k],
+            acceleration=acceleration[keep, k],
+            command=states["command"][keep, k],
+            servo=_servo_as_measured({name: s[:, k] for name, s in states.items()}, clock.period)[keep],
+            frequency=frequency,
+            gain=gains[k],
+        )
+        for k, joint in enumerate(joints)
+    ]
+
+
+def _servo_as_measured(states: dict[str, FloatArray], period: float) -> FloatArray:
+    """Torque of the servo in the state that was measured, by the law that it follows in the replay."""
+    law = np.column_stack(
+        [np.ones(len(states["servo"])), states["command"], states["predicted"], states["velocity"]]
+    )
+    weights = np.linalg.lstsq(law, states["servo"], rcond=1e-10)[0]
+    error = states["position"] - states["predicted"]
+    smooth = np.convolve(np.pad(error, 2, mode="edge"), np.full(5, 0.2), mode="valid")
+    return np.asarray(states["servo"] + weights[2] * error + weights[3] * np.gradient(smooth, period))
+
+
+def _commands(episode: Episode, columns: Sequence[int] | np.ndarray) -> FloatArray:
+    grid = episode.replay.grid
+    steps = np.minimum(grid.state[grid.before], grid.steps - 1)
+    return np.asarray(grid.command[steps][:, columns])
+
+
+def _impulse(moved: FloatArray, memory: int) -> FloatArray:
+    """Median response (memory, k) to pulses that come every `memory` samples, the first after `memory`."""
+    onsets = np.arange(memory, len(moved) - memory + 1, memory)
+    parts = np.stack([moved[o : o + memory] - moved[o - 1] for o in onsets])
+    response = np.median(parts, axis=0) if len(parts) > 2 else parts.mean(axis=0)
+    # dry friction may hold what a pulse has moved; a finite memory keeps the inversion stable
+    fade = memory // 3
+    response[memory - fade :] *= 0.5 * (1 + np.cos(np.linspace(0, np.pi, fade)))[:, None]
+    return np.asarray(response)
+
+
+@dataclass(frozen=True, eq=False)
+class _Inverse:
+    """Torque (n, k), its noise (k,), and at which frequency (cycles a sample) which fraction (f, k) is seen."""
+
+    torque: FloatArray
+    noise: FloatArray
+    frequency: FloatArray
+    gain: FloatArray
+
+
+def _wiener(error: FloatArray, response: FloatArray, floor: FloatArray) -> _Inverse:
+    """Most probable torques under white priors, whose sizes are those that explain the errors best (EM).
+
+    Parameters
+    ----------
+    error : (n, k) measured minus predicted positions.
+    response : (memory, k, k) of position i to one sample of unit torque j.
+    floor : (k,) noise of a sample.
+    """
+    from scipy.fft import next_fast_len
+
+    n, memory = len(error), len(response)
+    size = next_fast_len(n + 2 * memory, real=True)
+    # an error that ends abruptly would look like a blow
+    tail = error[-1] * (0.5 * (1 + np.cos(np.linspace(0, np.pi, memory))))[:, None]
+    padded = np.vstack([error, tail])
+    sigma = np.hypot(floor, LINEAR * np.sqrt(np.mean(error**2, axis=0)))
+    r = np.fft.rfft(padded / sigma, size, axis=0)
+    h = np.fft.rfft(response / sigma[:, None], size, axis=0)
+    hermitian = np.conj(np.swapaxes(h, 1, 2))
+    gram = hermitian @ h
+    inner = (hermitian @ r[:, :, None])[:, :, 0]
+    own = np.einsum("fii->fi", gram).real
+    prior = np.maximum(np.mean((padded / sigma) ** 2, axis=0) / np.mean(own, axis=0), 1e-300)
+    for _ in range(ITERATIONS):
+        posterior = np.linalg.inv(gram + np.eye(len(floor)) / prior)
+        spectrum = (posterior @ inner[:, :, None])[:, :, 0]
+        spread = np.einsum("fii->fi", posterior).real
+        prior = np.mean(np.abs(spectrum) ** 2 / size + spread, axis=0)
+    torque = np.fft.irfft(spectrum, size, axis=0)[:n]
+    seen = posterior @ gram
+    noise = np.sqrt(np.mean(np.einsum("fij,fji->fi", seen, posterior).real, axis=0))
+    gain = np.clip(np.einsum("fii->fi", seen).real, 0.0, 1.0)
+    return _Inverse(torque, noise, np.fft.rfftfreq(size), gain)
