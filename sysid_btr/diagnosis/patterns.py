@@ -14,6 +14,11 @@ GROW = 1.25
 FOLDS = 5
 BINS = 40
 """Bins of one period when a signal is folded."""
+REPEATS = 4
+"""Times that a period must fit into a signal."""
+MOST_PERIODS = 6000
+SHORTER = 0.85
+"""A shorter period is preferred if it explains at least this fraction of what the best one does."""
 
 
 @dataclass(frozen=True)
@@ -85,32 +90,39 @@ def fold(signal: FloatArray, time: FloatArray, period: float, bins: int = BINS) 
     return mean, count.astype(float)
 
 
-def repetition(signal: FloatArray, time: FloatArray, period: float) -> float:
-    """Share of a signal's variance that repeats with a period, corrected for the number of bins."""
-    n, bins = len(signal), int(min(BINS, max(period / (time[1] - time[0]), 2)))
+def repetition(signal: FloatArray, time: FloatArray, period: float, span: float | None = None) -> float:
+    """Share of a signal's variance that repeats with a period, less what a signal as smooth would by chance.
+
+    `span` is the memory of the signal in samples, where known.
+    """
+    n, step = len(signal), float(time[1] - time[0])
+    bins = int(min(BINS, max(period / step, 2)))
     mean, count = fold(signal - signal.mean(), time, period, bins)
     total = float(np.sum((signal - signal.mean()) ** 2))
     share = float(np.sum(count * mean**2)) / max(total, 1e-300)
-    return 1 - (1 - share) * (n - 1) / max(n - bins, 1)
+    span = memory(signal) if span is None else span
+    chance = min(bins, period / (span * step)) * span / n
+    return (share - chance) / max(1 - chance, 1e-6)
 
 
 def best_period(signal: FloatArray, time: FloatArray, shortest: float) -> tuple[float, float]:
     """The period that explains most of a signal by folding, not its multiples, and the share it explains."""
     duration = time[-1] - time[0]
-    longest = duration / 3
+    longest = duration / REPEATS
     if longest <= shortest:
         return 0.0, 0.0
-    # neighbouring periods drift apart by a bin over the whole signal
-    count = int(BINS * duration / 2 * (1 / shortest - 1 / longest)) + 2
-    periods = 1 / np.linspace(1 / shortest, 1 / longest, min(count, 6000))
-    shares = np.array([repetition(signal, time, p) for p in periods])
+    # neighbouring periods drift apart by half a bin over the whole signal
+    count = int(2 * BINS * duration * (1 / shortest - 1 / longest)) + 2
+    periods = 1 / np.linspace(1 / shortest, 1 / longest, min(count, MOST_PERIODS))
+    span = memory(signal)
+    shares = np.array([repetition(signal, time, p, span) for p in periods])
     best = int(np.argmax(shares))
-    enough = np.flatnonzero((shares >= 0.9 * shares[best]) & (periods <= 1.02 * periods[best]))
-    if shares[best] <= 0 or len(enough) == 0:
+    if shares[best] <= 0:
         return 0.0, 0.0
-    # the shortest period that does nearly as well; a multiple of it only adds noise
-    group = enough[periods[enough] <= 1.05 * periods[enough].min()]
-    at = int(group[np.argmax(shares[group])])
+    # a multiple of the period does as well, and only by noise better
+    enough = periods[shares >= SHORTER * shares[best]]
+    near = np.flatnonzero((periods >= enough.min()) & (periods <= 1.05 * enough.min()))
+    at = int(near[np.argmax(shares[near])])
     return float(periods[at]), float(shares[at])
 
 

@@ -18,6 +18,8 @@ from sysid_btr.models.scales import Scales
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.replay.structure import EVERYWHERE, limbs
 
+FAINT = 1e-4
+"""Squared response of a direction, relative to an effect's strongest one, below which it is not moved."""
 NO_RESPONSE = 1e-6
 """Response, relative to the residual, below which a log cannot show an effect."""
 
@@ -250,8 +252,8 @@ def _leak(basis: FloatArray, rows: IntArray, coefficients: FloatArray, rest: Flo
 def _legal(effect: type[Effect], gram: FloatArray, target: FloatArray) -> FloatArray:
     """Minimise a'Ga - 2 a't under the effect's signs; working points of thresholds are not stretched far."""
     if effect.signed:
-        ridge = 1e-9 * np.trace(gram) * np.eye(len(gram))
-        return np.asarray(np.linalg.solve(gram + ridge, target))
+        # directions that hardly any sensor sees stay at zero
+        return np.asarray(np.linalg.pinv(gram, rcond=FAINT, hermitian=True) @ target)
     from scipy.optimize import nnls
 
     values, vectors = np.linalg.eigh(gram)

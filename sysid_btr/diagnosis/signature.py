@@ -1,16 +1,57 @@
-"""What the residual looks like: proposals for effects with a place in time or angle, and words for the rest."""
+"""What the residual looks like: proposals for effects with a place in time or angle, and words for the rest.
+
+Both look at the torque that would explain the position error (`sysid_btr.diagnosis.torque`), because a torque
+is local in time where a position error is smeared out by the servo.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis import patterns
+from sysid_btr.diagnosis.patterns import Line, Train, hats, predicted_share, without
 from sysid_btr.diagnosis.scan import Question
+from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
 from sysid_btr.effects.base import Effect
+from sysid_btr.effects.cogging import Cogging
+from sysid_btr.effects.external_disturbance import (
+    DriveDisturbanceTrain,
+    ExternalDisturbance,
+    ExternalDisturbanceTrain,
+)
 from sysid_btr.identify.study import Study
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem
+
+LOUD = 1.3
+"""Chi2 of a joint's position from which its error is looked at."""
+SMALL = 0.01
+"""Excess, relative to the worst joint's, below which a joint has to wait."""
+CLEAR = 50.0
+"""A pulse stands out if it explains this many times what noise of the same colour would."""
+SHORTEST_PULSE = 0.02
+SHORTEST_PERIOD = 0.3
+"""Seconds."""
+TRAIN_SHARE = 0.15
+"""Share of the variance that a pulse train must explain to be proposed."""
+LINE_SHARE, LINE_CLEAR = 0.03, 8.0
+"""Share of the variance that a spatial frequency must explain, alone and relative to the median one."""
+LINES = 2
+OWN_RHYTHM = 0.7
+"""Share of the command that repeats with a period, from which that period is the motion's own."""
+STRETCH = 0.5
+"""Seconds that are predicted from the others when a dependence is weighed."""
+NEARLY = 0.07
+"""A simpler dependence is preferred if its share is within this of the best one's."""
+WEAK = 0.2
+"""Share of the missing torque below which a dependence is none."""
+DESCRIBED = 3
+"""Joints that are described."""
 
 
 def proposals(
@@ -20,8 +61,331 @@ def proposals(
     residual: FloatArray,
     library: Sequence[type[Effect]],
 ) -> list[Question]:
-    return []
+    """Questions about effects whose place in time or angle only the residual can tell.
+
+    Parameters
+    ----------
+    study : robot and logs.
+    problem, values : data, modifiers and their parameters.
+    residual : (r,) whitened, there.
+    library : effects that may be asked for.
+    """
+    wanted = {Cogging, ExternalDisturbance, ExternalDisturbanceTrain, DriveDisturbanceTrain} & set(library)
+    if not wanted or not _loud(problem, residual):
+        return []
+    asked: list[Question] = []
+    torques = missing_torques(problem, values, study.scales)
+    worst = max((_blame(t) for t in torques), default=0.0)
+    for one in torques:
+        if one.chi2 < LOUD or _blame(one) < SMALL * worst:
+            continue
+        scale, place = study.scales[one.joint], (one.joint,)
+        if Cogging in wanted:
+            asked += [Question(Cogging, place, Cogging.probe_at(scale, x.number)) for x in spatial_lines(one)]
+        if ExternalDisturbance in wanted and (push := single_pulse(one)) is not None:
+            asked.append(Question(ExternalDisturbance, place, ExternalDisturbance.probe_at(scale, *push)))
+        train = pulse_train(one)
+        if train is None:
+            continue
+        when = (train.start, train.duration, train.period)
+        if ExternalDisturbanceTrain in wanted:
+            probe = ExternalDisturbanceTrain.probe_at(scale, *when)
+            asked.append(Question(ExternalDisturbanceTrain, place, probe))
+        # without a measured effort both trains leave the same trace
+        if DriveDisturbanceTrain in wanted and any(t.channel == "effort" for t in problem.episodes[0].targets):
+            probe = DriveDisturbanceTrain.probe_at(scale, *when)
+            asked.append(Question(DriveDisturbanceTrain, place, probe))
+    return asked
+
+
+def _loud(problem: ReplayProblem, residual: FloatArray) -> bool:
+    sums = np.bincount(problem.column_labels, residual**2, len(problem.columns))
+    count = np.maximum(np.bincount(problem.column_labels, minlength=len(problem.columns)), 1)
+    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
+    return bool(np.any(factor * sums / count >= LOUD))
+
+
+def _direction(one: MissingTorque) -> FloatArray:
+    """Sign of velocity, smooth where a measured sign would be a matter of noise."""
+    size = float(np.sqrt(np.mean(one.velocity**2)))
+    return np.asarray(np.tanh(one.velocity / max(0.05 * size, 1e-300)))
+
+
+def _unit(x: FloatArray) -> FloatArray:
+    """Centred, with a largest value of one."""
+    centred = x - x.mean()
+    return np.asarray(centred / max(float(np.abs(centred).max()), 1e-300))
+
+
+def _of_motion(one: MissingTorque, degree: int = 3) -> FloatArray:
+    """What friction, inertia, springs and gravity explain, to be set aside before searching; (n, 3 + degree)."""
+    q = _unit(one.position)
+    powers = [q**k for k in range(1, degree + 1)]
+    columns = (_direction(one), one.velocity, one.acceleration, *powers)
+    return one.seen(np.column_stack([_unit(c) for c in columns]))
+
+
+def spatial_lines(one: MissingTorque) -> list[Line]:
+    """Spatial frequencies at which the torque repeats with the joint's angle, best first, at most two."""
+    span = float(np.ptp(one.position))
+    if span <= 0:
+        return []
+    together = -(-len(one.torque) // 4096)
+    rows = slice(None, None, together)
+    turn = 2 * np.pi / span
+    # a line faster than the sensor resolves leaves nothing, whatever its spatial frequency
+    fastest = 0.5 / (together * one.period) / max(float(np.median(np.abs(one.velocity))), 1e-300) * 2 * np.pi
+    numbers = np.arange(turn, min(200 * turn, max(fastest, 4 * turn)), 0.4 * turn)
+    motion = _of_motion(one, 1)[rows]
+
+    def shares(at: FloatArray) -> FloatArray:
+        pairs = [
+            one.seen(np.column_stack([np.sin(n * one.position), np.cos(n * one.position)]))[rows] for n in at
+        ]
+        return patterns.line_shares(one.torque[rows], pairs, motion)
+
+    found = shares(numbers)
+    if len(found) < 5:
+        return []
+    clear = max(LINE_SHARE, LINE_CLEAR * float(np.median(found)))
+    inner = np.flatnonzero((found[1:-1] >= found[:-2]) & (found[1:-1] >= found[2:]) & (found[1:-1] > clear)) + 1
+    lines = []
+    for k in inner[np.argsort(-found[inner])][:LINES]:
+        near = numbers[k] + turn * np.linspace(-0.4, 0.4, 17)
+        sharper = shares(near)
+        at = int(np.argmax(sharper))
+        lines.append(Line(float(near[at]), float(sharper[at])))
+    return lines
+
+
+def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
+    """Start (s since the first sample) and duration of the clearest pulse, or None."""
+    rest = without(one.torque, _of_motion(one))
+    box = patterns.best_box(rest, max(round(SHORTEST_PULSE / one.period), 2))
+    if box is None:
+        return None
+    outside = np.ones(len(rest), dtype=bool)
+    outside[box.start : box.stop] = False
+    others = rest[outside] - np.median(rest[outside])
+    noise = max(1.4826 * float(np.median(np.abs(others))), one.noise)
+    length = box.stop - box.start
+    if box.height**2 * length < CLEAR * noise**2 * max(min(patterns.memory(others), length), 1.0):
+        return None
+    return float(one.time[box.start]), length * one.period
+
+
+def pulse_train(one: MissingTorque) -> Train | None:
+    """Equal pulses at regular intervals that are not the motion's own, or None."""
+    rest = without(one.torque, _of_motion(one))
+    period, share = patterns.best_period(rest, one.time, SHORTEST_PERIOD)
+    if share < TRAIN_SHARE or _rhythm_of_motion(one, period):
+        return None
+    train = patterns.best_train(rest, one.time, period)
+    return train if train.share >= TRAIN_SHARE else None
+
+
+def _rhythm_of_motion(one: MissingTorque, period: float) -> bool:
+    return patterns.repetition(one.command, one.time, period) > OWN_RHYTHM
 
 
 def signature(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -> dict[str, Any]:
-    return {"summary": "not characterised"}
+    """Describe what a model leaves of the training data, as missing torque at the joints.
+
+    Parameters
+    ----------
+    study : robot and logs.
+    modifiers, values : the model, (p,).
+
+    Returns
+    -------
+    dict
+        JSON-able: ``summary`` in words; ``joints``, the worst first, each with ``chi2``, ``share`` of the
+        excess over the noise floor, rms of the missing torque, where it is ``localised`` in time,
+        ``periodic`` or None, and ``dependence``: the share of the missing torque that is predicted from a
+        state of the robot on stretches of time left out (a correlation ratio free of the bias of its bins).
+    """
+    torques = missing_torques(study.train_problem(modifiers), values, study.scales)
+    if not torques:
+        return {"summary": "not characterised: the replay fails or is too short", "joints": []}
+    loud = sorted((t for t in torques if t.chi2 >= LOUD), key=lambda t: -_blame(t))
+    if not loud:
+        return {"summary": "no torque at any joint: positions are at their noise floor", "joints": []}
+    # one episode a joint: the one that shows most
+    chosen = list({t.joint: t for t in reversed(loud)}.values())[::-1]
+    total = sum(_blame(t) for t in chosen)
+    entries = []
+    for one in chosen[:DESCRIBED]:
+        share = _blame(one) / max(total, 1e-300)
+        if entries and share < 0.05:
+            break
+        entries.append({"joint": one.joint, "share": share, **_describe(one, torques)})
+    return {"summary": "; ".join(e.pop("words") for e in entries), "joints": entries}
+
+
+def _blame(one: MissingTorque) -> float:
+    """Excess over the noise floor, as far as a torque at this joint, not at others, explains it."""
+    power = float(np.mean(one.torque**2))
+    return (one.chi2 - 1) * max(power - one.noise**2, 0.0) / max(power, 1e-300)
+
+
+@dataclass(frozen=True, eq=False)
+class _Feature:
+    """Something a missing torque may depend on: a name, words, and the functions tried; simplest first."""
+
+    name: str
+    words: str
+    design: FloatArray
+
+
+def _describe(one: MissingTorque, torques: Sequence[MissingTorque]) -> dict[str, Any]:
+    rms = float(np.std(one.torque))
+    real = max(rms**2 - one.noise**2, 0.05 * rms**2)
+    periodic = _periodic(one)
+    block = max(round(STRETCH / one.period), 1)
+    together = -(-len(one.torque) // 4096)
+    rows = slice(None, None, together)
+    features = list(_features(one, torques, periodic))
+    shares = []
+    for feature in features:
+        seen = one.seen(feature.design)[rows]
+        share = predicted_share(one.torque[rows], seen, max(block // together, 1))
+        shares.append(float(np.clip(share * rms**2 / real, 0.0, 1.0)))
+    best = max(shares)
+    chosen = next(i for i, s in enumerate(shares) if s >= best - NEARLY)
+    localised = _localised(one)
+    known = best >= WEAK
+    drift = _gain_rhythm(one) if known and features[chosen].name == "torque_and_time" else None
+    words = _words(one, rms, localised, periodic, features[chosen] if known else None, drift)
+    return {
+        "chi2": one.chi2,
+        "torque_rms": rms,
+        "torque_noise": one.noise,
+        "unit": one.unit,
+        "localised": localised,
+        "periodic": periodic,
+        "gain_period": drift,
+        "dependence": [
+            {"on": f.name, "share": s} for s, f in sorted(zip(shares, features, strict=True), key=lambda x: -x[0])
+        ],
+        "best": features[chosen].name if known else "none",
+        "words": words,
+    }
+
+
+def _localised(one: MissingTorque) -> dict[str, float]:
+    """The second that holds most of the excess, and its share of it."""
+    excess = one.residual**2 - 1
+    width = min(max(round(1.0 / one.period), 1), len(excess))
+    sums = np.concatenate([[0.0], np.cumsum(excess)])
+    window = sums[width:] - sums[:-width]
+    at = int(np.argmax(window))
+    return {"share": float(np.clip(window[at] / max(sums[-1], 1e-300), 0, 1)), "start": float(one.time[at])}
+
+
+def _periodic(one: MissingTorque) -> dict[str, Any] | None:
+    """How the missing torque repeats in time: itself, or only its size."""
+    rest = without(one.torque, _of_motion(one))
+    size = np.abs(rest)
+    options = []
+    for signal, same_sign in ((rest, True), (size, False)):
+        period, share = patterns.best_period(signal, one.time, SHORTEST_PERIOD)
+        if share > 0 and not _rhythm_of_motion(one, period):
+            options.append((share, same_sign, period, signal))
+    if not options:
+        return None
+    # pulses of either sign may happen to alternate: then the shorter period is the true one
+    share, same_sign, period, signal = options[0]
+    if len(options) > 1 and (options[1][0] > share or options[1][2] < 0.6 * period):
+        share, same_sign, period, signal = options[1]
+    if share < TRAIN_SHARE:
+        return None
+    train = patterns.best_train(signal, one.time, period)
+    on = np.mod(one.time - train.start, train.period) < train.duration
+    inside = rest[on] if on.any() else rest
+    return {
+        "period": train.period,
+        "start": train.start,
+        "duration": train.duration,
+        "amplitude": train.height if same_sign else float(np.sqrt(np.mean(inside**2))),
+        "same_sign": same_sign,
+        "share": share,
+    }
+
+
+def _features(
+    one: MissingTorque, torques: Sequence[MissingTorque], periodic: dict[str, Any] | None
+) -> Iterator[_Feature]:
+    """What is tried, from simple to complicated."""
+    sign, load, q = _direction(one), one.servo, one.position
+
+    def of(x: FloatArray, count: int) -> FloatArray:
+        return hats(x, patterns.even_knots(x, count))
+
+    yield _Feature("direction", "the sign of the velocity", sign[:, None])
+    yield _Feature("load", "the load and the sign of the velocity", np.column_stack([sign, np.abs(load) * sign]))
+    yield _Feature("acceleration", "the acceleration", of(one.acceleration, 6))
+    yield _Feature("command_rate", "the rate of the command", of(np.gradient(one.command, one.period), 7))
+    yield _Feature("torque", "the servo's torque", of(load, 8))
+    yield _Feature("velocity", "the velocity", of(one.velocity, 10))
+    yield _Feature("position", "the position", of(q, 10))
+    for line in spatial_lines(one)[:1]:
+        pair = np.column_stack([np.sin(line.number * q), np.cos(line.number * q)])
+        yield _Feature("fine_position", f"the position, {line.number:.3g} rad per unit", pair)
+    patch = hats(q, np.linspace(q.min(), q.max(), 14))
+    yield _Feature(
+        "position_and_direction", "the position, against the motion", np.column_stack([sign[:, None] * patch])
+    )
+    for other in torques:
+        if other.episode == one.episode and other.joint != one.joint:
+            own = np.column_stack([_unit(q), of(other.position, 5)])
+            yield _Feature(f"position:{other.joint}", f"the position of {other.joint}", own)
+    if periodic is not None:
+        phase = np.mod((one.time - periodic["start"]) / periodic["period"] + 0.25, 1.0)
+        count = int(np.clip(2 * periodic["period"] / max(periodic["duration"], one.period), 10, 40))
+        beat = hats(phase, np.linspace(0, 1, count))
+        again = f"the time within a period of {periodic['period']:.3g} s"
+        yield _Feature("phase", again, beat)
+        yield _Feature("torque_and_phase", f"the servo's torque and {again}", beat * one.servo_measured[:, None])
+    knots = np.linspace(one.time[0], one.time[-1], int(np.clip((one.time[-1] - one.time[0]) / 1.5, 3, 25)))
+    slow = hats(one.time, knots)
+    yield _Feature("time", "time alone, slowly", slow)
+    yield _Feature("torque_and_time", "the servo's torque, by a gain that drifts", slow * load[:, None])
+
+
+def _gain_rhythm(one: MissingTorque) -> float | None:
+    """Period of a gain that comes and goes, s; None where it only drifts."""
+    duration = float(one.time[-1] - one.time[0])
+    periods = 1 / np.linspace(1 / duration, 1.0, 80)
+    load = one.servo
+    pairs = []
+    for period in periods:
+        angle = 2 * np.pi * one.time / period
+        pairs.append(one.seen(np.column_stack([load * np.sin(angle), load * np.cos(angle)])))
+    shares = patterns.line_shares(one.torque, pairs, one.seen(load[:, None]))
+    best = int(np.argmax(shares))
+    return float(periods[best]) if shares[best] > 0.5 else None
+
+
+def _words(
+    one: MissingTorque,
+    rms: float,
+    localised: dict[str, float],
+    periodic: dict[str, Any] | None,
+    feature: _Feature | None,
+    drift: float | None,
+) -> str:
+    text = f"a torque at {one.joint} of {rms:.2g} {one.unit} rms"
+    if one.unit == "N":
+        text = text.replace("torque", "force")
+    if localised["share"] > 0.5:
+        text += f", {100 * localised['share']:.0f} % of its trace in the second after t = {localised['start']:.3g} s"
+    elif periodic is not None and (feature is None or feature.name.endswith("phase")):
+        kind = "" if periodic["same_sign"] else " of either sign"
+        text += (
+            f", in pulses{kind} of {periodic['amplitude']:.2g} {one.unit} and {periodic['duration']:.2g} s"
+            f" every {periodic['period']:.4g} s, the first at {periodic['start']:.3g} s"
+        )
+    if feature is None:
+        return text + ", which no state of the robot predicts"
+    text += f", a function of {feature.words}"
+    return text if drift is None else text + f" with a period of {drift:.2g} s"

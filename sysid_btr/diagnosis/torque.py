@@ -50,7 +50,9 @@ class MissingTorque:
     residual : (n,) position error in noise floors.
     chi2 : its mean square; 1 at the noise floor.
     position, velocity, acceleration : (n,) position as measured, derivatives as replayed.
-    command, servo : (n,) command and torque of the servo.
+    command : (n,) of the servo.
+    servo, servo_measured : (n,) torque of the servo in the state that is replayed and in the one measured.
+        The latter is what a failing servo does not give; but it also answers every disturbance.
     frequency, gain : (f,) Hz and fraction of a torque at that frequency that `torque` shows.
     """
 
@@ -68,6 +70,7 @@ class MissingTorque:
     acceleration: FloatArray
     command: FloatArray
     servo: FloatArray
+    servo_measured: FloatArray
     frequency: FloatArray
     gain: FloatArray
 
@@ -199,7 +202,7 @@ def _deconvolve(
             episode=number,
             unit=scale_at(scales, joint).unit("Nm"),
             period=clock.period,
-            time=(np.arange(len(error)) * clock.period + 0.5 * (clock.together - 1) * clock.fine)[keep],
+            time=(np.arange(len(error)) * clock.period)[keep],
             torque=torque[keep, k],
             noise=float(noise[k]),
             residual=(error[:, k] / target.noise[k])[keep],
@@ -208,7 +211,8 @@ def _deconvolve(
             velocity=states["velocity"][keep, k],
             acceleration=acceleration[keep, k],
             command=states["command"][keep, k],
-            servo=_servo_as_measured({name: s[:, k] for name, s in states.items()}, clock.period)[keep],
+            servo=states["servo"][keep, k],
+            servo_measured=_servo_as_measured({name: s[:, k] for name, s in states.items()}, clock.period)[keep],
             frequency=frequency,
             gain=gains[k],
         )

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 ARM = 0.05
 """Distance, m, of a load whose mass a scan cannot tell from its place."""
 
+LEVERS = (0.03, 0.2)
+"""Distances, m, that a scan is believed."""
+
 
 @dataclass(frozen=True)
 class Payload(Effect):
@@ -52,14 +55,15 @@ class Payload(Effect):
     def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
         """The probe's directions are equal loads at several places: amounts add, places average."""
         total = float(np.sum(amounts))
-        if total <= 0.05 * float(np.sum(np.abs(amounts))):
+        moment = np.dot(amounts, [[d[0] * x for x in d[1:]] for d in probe])
+        size = float(np.linalg.norm(moment))
+        lever = size / (total * probe[0][0]) if total > 0 else 0.0
+        if not LEVERS[0] <= lever <= LEVERS[1]:
             # the mass is hardly told: begin from one that has the moment at a hand's breadth
-            moment = np.dot(amounts, [[d[0] * x for x in d[1:]] for d in probe])
-            size = float(np.linalg.norm(moment))
             if size == 0:
                 return None
-            mass = size / ARM
-            return np.array([min(mass, cls.kinds[0].upper), *(moment / mass)])
+            mass = min(size / ARM, cls.kinds[0].upper)
+            return np.array([mass, *(moment / mass)])
         kinds = cls.sized(scale)
         values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
         values[0] *= total
