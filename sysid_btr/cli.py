@@ -165,6 +165,14 @@ EstimatorName = Annotated[
     str,
     typer.Option("--estimator", metavar="NAME", help="lsq, ga, cmaes, nlopt:ALGORITHM, or one installed."),
 ]
+DistanceName = Annotated[
+    str,
+    typer.Option(
+        "--distance",
+        metavar="NAME",
+        help="What is minimised: likelihood (squares over noise); mse or phi2[:BINS], with ga, cmaes or nlopt.",
+    ),
+]
 MaxEvaluations = Annotated[
     int | None, typer.Option("--max-evaluations", min=1, help="Stop the search after this many replays.")
 ]
@@ -302,6 +310,7 @@ def fit(
     bounds: Bounds = None,
     channels: Channels = None,
     estimator: EstimatorName = "lsq",
+    distance: DistanceName = "likelihood",
     max_evaluations: MaxEvaluations = None,
     seed: Seed = 0,
     threads: Threads = 0,
@@ -320,11 +329,13 @@ def fit(
     from sysid_btr.estimators import get_estimator
     from sysid_btr.estimators.base import Budget
     from sysid_btr.identify.fit import fit as fit_study
+    from sysid_btr.objectives.distance import get_distance
 
     robot = find_robot(model, bounds)
     if not free:
         raise UsageError(what_can_be_freed(robot))
     chosen = get_estimator(estimator)
+    wanted = get_distance(distance)
     request = Request(
         "fit",
         robot,
@@ -334,7 +345,7 @@ def fit(
         channels,
         threads,
         seed,
-        {"estimator": estimator, "start": start or [], "bounds": bounds or []},
+        {"estimator": estimator, "distance": distance, "start": start or [], "bounds": bounds or []},
     )
     keeper = Keeper.open(out, resume, overwrite, request)
 
@@ -350,6 +361,7 @@ def fit(
             journal=keeper.journal,
             progress=progress,
             start=start_values(parameters, start),
+            distance=wanted,
         )
 
     _finish(request, keeper, job, as_json)

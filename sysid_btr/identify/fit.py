@@ -19,6 +19,7 @@ from sysid_btr.identify.refit import inflate, refit, robust_refit
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
 from sysid_btr.models.modifier import Modifier
+from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def fit(
     journal: Journal | None = None,
     progress: Progress = silent,
     start: FloatArray | None = None,
+    distance: Distance | None = None,
 ) -> Fit:
     """Fit parameters of the model to the training part of a study.
 
@@ -84,6 +86,13 @@ def fit(
     rng : for estimators that draw; default seed 0.
     budget, journal, progress : see `sysid_btr.estimators`.
     start : (p,) where to begin; default the nominal values.
+    distance : minimised instead of the whitened squares (MSE, phi2), by an estimator that needs no residuals.
+        Intervals are then those of the likelihood at the point found.
+
+    Raises
+    ------
+    UsageError
+        If nothing is freed, or least squares are asked to minimise a distance.
 
     Returns
     -------
@@ -107,7 +116,10 @@ def fit(
             study = inflate(study, coarse, memory=True)
         rough = coarse.evaluations
         problem = study.train_problem(modifiers, coarse.values)
-    result = estimator.fit(problem, rng=rng, budget=budget or Budget(), journal=journal, progress=progress)
+    if distance is not None and isinstance(estimator, LeastSquares):
+        raise UsageError("lsq minimises squared residuals: for another distance choose ga, cmaes or nlopt:ALGORITHM")
+    goal = problem if distance is None else DistanceProblem(problem, distance)
+    result = estimator.fit(goal, rng=rng, budget=budget or Budget(), journal=journal, progress=progress)
     replays = result.evaluations + rough
     values, jacobian, residual = _at_optimum(problem, result)
     for _ in range(MAX_REFINEMENTS):
@@ -116,7 +128,8 @@ def fit(
         std = np.array([e.std for e in found])
         worst = np.max(np.abs(shift) / np.maximum(std, 1e-300), initial=0.0)
         misfit = before_chi2(problem, residual)
-        if worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or misfit > FAR:
+        digital = study.numerics.integrator == "Euler"
+        if not isinstance(estimator, LeastSquares) or worst <= SHIFT_TOLERATED or digital or misfit > FAR:
             break
         study = replace(study, numerics=study.numerics.halved())
         problem = study.train_problem(modifiers, values)
@@ -126,7 +139,9 @@ def fit(
         replays += polished.evaluations
         values, jacobian, residual = _at_optimum(problem, polished)
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift)
-    values, found, extra = hold_unidentifiable(problem, values, found)
+    extra = 0
+    if isinstance(estimator, LeastSquares):
+        values, found, extra = hold_unidentifiable(problem, values, found)
     return Fit(
         study=study,
         modifiers=modifiers,

@@ -1,0 +1,178 @@
+"""Distances between a log and a replay that need not be sums of squares: MSE, phi1, phi2.
+
+phi1 and phi2 are those of Zagal, Delpiano, Ruiz-del-Solar, Self-modeling in humanoid soccer robots, Robotics
+and Autonomous Systems 57 (2009), equations 4 to 6, doi:10.1016/j.robot.2009.03.010; the information distance
+d(X, Y) = H(X|Y) + H(Y|X) is Crutchfield's (1990).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.errors import UsageError
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.objectives.targets import Target
+
+DEFAULT_BINS = 20
+
+
+class Distance(Protocol):
+    """Distance of predictions to one measured channel."""
+
+    def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
+        """Distances (m,) of predictions (m, n, k) to a target; non-finite where a candidate failed."""
+        ...
+
+
+@dataclass(frozen=True)
+class MeanSquare:
+    """Mean squared error over all samples that count, SI units squared, not whitened."""
+
+    def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
+        error = (target.measured - predicted)[:, target.mask]
+        return np.asarray(np.mean(error**2, axis=1))
+
+
+@dataclass(frozen=True)
+class Phi2:
+    """Information distance summed over joints, bits; the motor term is zero for replayed commands.
+
+    Attributes
+    ----------
+    bins : intervals of equal width over the measured range of each joint; never finer than the encoder's step.
+    correction : ``miller-madow`` removes the first-order bias of plug-in entropies
+        (doi:10.1162/089976603321780272), ``none`` leaves it.
+
+    Notes
+    -----
+    Joints that stand still (measured range below two encoder steps) only add a constant and are left out. The
+    distance is blind to any one-to-one relabelling of bins: an offset or a gain of a sensor may go unnoticed.
+    """
+
+    bins: int = DEFAULT_BINS
+    correction: Literal["miller-madow", "none"] = "miller-madow"
+
+    def __post_init__(self) -> None:
+        if self.bins < 2:
+            raise UsageError(f"phi2 needs at least 2 bins, not {self.bins}")
+
+    def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
+        total = np.zeros(len(predicted))
+        for k, floor in enumerate(target.floor):
+            good = target.mask[:, k]
+            measured = target.measured[good, k]
+            low, high = float(measured.min()), float(measured.max())
+            if high - low <= 2 * max(floor.step, floor.sigma):
+                continue
+            count = self.bins
+            if floor.step > 0:
+                count = max(2, min(count, int((high - low) / floor.step)))
+            x = _label(measured, low, high, count)
+            for m, row in enumerate(predicted[:, good, k]):
+                total[m] += (
+                    information_distance(x, _label(row, low, high, count), self.correction)
+                    if np.isfinite(row).all()
+                    else np.inf
+                )
+        return total
+
+
+def phi1(real: FloatArray, simulated: FloatArray) -> FloatArray:
+    """Mean absolute difference of fitness over controllers (equation 4).
+
+    Parameters
+    ----------
+    real : (controllers,) fitness on the robot.
+    simulated : (m, controllers) fitness of the same controllers in m candidate simulations.
+
+    Returns
+    -------
+    ndarray
+        (m,) in the unit of the fitness.
+    """
+    return np.asarray(np.mean(np.abs(np.atleast_2d(simulated) - real), axis=1))
+
+
+def information_distance(
+    x: IntArray, y: IntArray, correction: Literal["miller-madow", "none"] = "none"
+) -> float:
+    """d(X, Y) = H(X|Y) + H(Y|X) = 2 H(X, Y) - H(X) - H(Y) of two series of labels, bits."""
+    joint = x.astype(np.int64) * (int(y.max()) + 1) + y
+    corrected = correction == "miller-madow"
+    return max(0.0, 2 * _entropy(joint, corrected) - _entropy(x, corrected) - _entropy(y, corrected))
+
+
+def _label(values: FloatArray, low: float, high: float, bins: int) -> IntArray:
+    """Bins of equal width over a range; what lies outside goes to a bin of its own on either side."""
+    inside = np.floor((values - low) / (high - low) * bins).astype(np.int64)
+    inside[values == high] = bins - 1
+    return np.clip(inside, -1, bins) + 1
+
+
+def _entropy(labels: IntArray, corrected: bool) -> float:
+    counts = np.unique(labels, return_counts=True)[1]
+    p = counts / len(labels)
+    plain = -float(np.sum(p * np.log2(p)))
+    return plain + ((len(counts) - 1) / (2 * len(labels) * np.log(2)) if corrected else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceProblem:
+    """A replay problem scored by a distance instead of a likelihood; it has no residuals.
+
+    Attributes
+    ----------
+    whole : replays and targets.
+    distance : summed over the targets of all episodes.
+    """
+
+    whole: ReplayProblem
+    distance: Distance
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.whole.names
+
+    @property
+    def lower(self) -> FloatArray:
+        return self.whole.lower
+
+    @property
+    def upper(self) -> FloatArray:
+        return self.whole.upper
+
+    @property
+    def start(self) -> FloatArray:
+        return self.whole.start
+
+    def loss(self, candidates: FloatArray) -> FloatArray:
+        """Distances (m,) of candidates (m, p)."""
+        candidates = np.atleast_2d(candidates)
+        total = np.zeros(len(candidates))
+        for episode in self.whole.episodes:
+            for rows, outputs in episode.replay.chunks(candidates):
+                for target in episode.targets:
+                    total[rows] += self.distance(target, target.predicted(outputs))
+        return total
+
+
+def get_distance(name: str) -> Distance | None:
+    """A distance by name: ``likelihood`` (None), ``mse``, ``phi2`` or ``phi2:BINS``.
+
+    Raises
+    ------
+    UsageError
+        Listing what there is.
+    """
+    base, _, bins = name.partition(":")
+    if name == "likelihood":
+        return None
+    if name == "mse":
+        return MeanSquare()
+    if base == "phi2" and (not bins or bins.isdigit()):
+        return Phi2(int(bins)) if bins else Phi2()
+    raise UsageError(f"unknown distance {name!r}; there are likelihood, mse, phi2 and phi2:BINS (such as phi2:20)")
