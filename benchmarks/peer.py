@@ -106,7 +106,8 @@ def peer(
 
     names = [replay.model.joint(int(plain.actuator_trnid[a, 0])).name for a in range(plain.nu)]
     columns = [index.joints.index(name) for name in names]
-    times = grid.timestep * np.arange(grid.steps + 1)
+    # a hair short: the peer rounds the number of its steps up, and would stretch the commands by one
+    times = grid.timestep * np.arange(grid.steps + 1) * (1 - 1e-12)
     control = sysid.TimeSeries.from_control_names(
         times, np.vstack([grid.command, grid.command[-1:]])[:, columns], plain
     )
@@ -135,7 +136,8 @@ def peer(
     )
 
     def run() -> Run:
-        params = _peer_parameters(problem, spec, plain)
+        # nominal masses from a fresh spec: a run leaves its last candidate in the one it uses
+        params = _peer_parameters(problem, replay.robot.make_spec(), plain)
         trace = Trace()
         talk = StringIO()
 

@@ -108,6 +108,10 @@ def repetition(signal: FloatArray, time: FloatArray, period: float, span: float 
 def best_period(signal: FloatArray, time: FloatArray, shortest: float) -> tuple[float, float]:
     """The period that explains most of a signal by folding, not its multiples, and the share it explains."""
     duration = time[-1] - time[0]
+    together = max(int(0.5 * shortest / BINS / (time[1] - time[0])), 1)
+    whole = len(signal) // together * together
+    signal = signal[:whole].reshape(-1, together).mean(axis=1)
+    time = time[:whole:together]
     longest = duration / REPEATS
     if longest <= shortest:
         return 0.0, 0.0
@@ -133,19 +137,21 @@ def best_train(signal: FloatArray, time: FloatArray, period: float) -> Train:
     mean, count = fold(signal - signal.mean(), time, period, bins)
     start, length = _circular_box(mean * count, count)
     train = np.array([start / bins * period, length / bins * period, period])
+    # seen from a pulse in the middle, start and period are independent
+    train[0] += np.round((0.5 * (time[0] + time[-1]) - train[0]) / period) * period
     span = time[-1] - time[0]
     scale = np.array([period / bins, period / bins, period / bins * period / span])
     best = _explained(signal, time, train)
-    for _ in range(5):
+    for _ in range(7):
         for i in range(3):
             trials = np.tile(train, (13, 1))
-            trials[:, i] += np.linspace(-1.5, 1.5, 13) * scale[i]
+            trials[:, i] += np.linspace(-2, 2, 13) * scale[i]
             trials[:, 1:] = np.maximum(trials[:, 1:], step)
             shares = [_explained(signal, time, trial)[0] for trial in trials]
             k = int(np.argmax(shares))
             if shares[k] > best[0]:
                 train, best = trials[k], _explained(signal, time, trials[k])
-        scale *= 0.5
+        scale *= 0.6
     first = float(np.mod(train[0], train[2]))
     return Train(first, float(train[1]), float(train[2]), best[1], best[0])
 

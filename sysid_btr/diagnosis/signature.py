@@ -37,6 +37,8 @@ CLEAR = 50.0
 SHORTEST_PULSE = 0.02
 SHORTEST_PERIOD = 0.3
 """Seconds."""
+OUTLIER = 4.0
+"""Times the usual size from which a torque of either sign counts as an event."""
 TRAIN_SHARE = 0.15
 """Share of the variance that a pulse train must explain to be proposed."""
 LINE_SHARE, LINE_CLEAR = 0.03, 8.0
@@ -285,7 +287,8 @@ def _localised(one: MissingTorque) -> dict[str, float]:
 def _periodic(one: MissingTorque) -> dict[str, Any] | None:
     """How the missing torque repeats in time: itself, or only its size."""
     rest = without(one.torque, _of_motion(one))
-    size = np.abs(rest)
+    # whether there is a torque rather than how large it is: a pulse depends on the load of its moment
+    size = (np.abs(rest) > OUTLIER * 1.4826 * float(np.median(np.abs(rest)))).astype(float)
     options = []
     for signal, same_sign in ((rest, True), (size, False)):
         period, share = patterns.best_period(signal, one.time, SHORTEST_PERIOD)
@@ -323,11 +326,11 @@ def _features(
 
     yield _Feature("direction", "the sign of the velocity", sign[:, None])
     yield _Feature("load", "the load and the sign of the velocity", np.column_stack([sign, np.abs(load) * sign]))
-    yield _Feature("acceleration", "the acceleration", of(one.acceleration, 6))
-    yield _Feature("command_rate", "the rate of the command", of(np.gradient(one.command, one.period), 7))
     yield _Feature("torque", "the servo's torque", of(load, 8))
     yield _Feature("velocity", "the velocity", of(one.velocity, 10))
     yield _Feature("position", "the position", of(q, 10))
+    yield _Feature("acceleration", "the acceleration", of(one.acceleration, 6))
+    yield _Feature("command_rate", "the rate of the command", of(np.gradient(one.command, one.period), 7))
     for line in spatial_lines(one)[:1]:
         pair = np.column_stack([np.sin(line.number * q), np.cos(line.number * q)])
         yield _Feature("fine_position", f"the position, {line.number:.3g} rad per unit", pair)

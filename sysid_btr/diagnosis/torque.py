@@ -21,7 +21,7 @@ from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target
 from sysid_btr.replay.structure import limbs
 
-MOST_SAMPLES = 16384
+MOST_SAMPLES = 8192
 """Longer episodes are averaged down to this many samples."""
 LINEAR = 0.02
 """Relative error of a linear response: this fraction of a residual counts as noise on top of the sensor's."""

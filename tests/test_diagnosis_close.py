@@ -1,0 +1,242 @@
+"""Closing the loop: what a log hides is named where it is, and nothing is named that is not there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import toys
+
+from sysid_btr.diagnosis.close import close
+from sysid_btr.diagnosis.closing import Closing, NamedEffect
+from sysid_btr.effects.armature import Armature
+from sysid_btr.effects.backlash import Backlash
+from sysid_btr.effects.base import Effect
+from sysid_btr.effects.com_offset import ComOffset
+from sysid_btr.effects.command_delay import CommandDelay
+from sysid_btr.effects.constant_force import ConstantForce
+from sysid_btr.effects.coulomb_friction import CoulombFriction
+from sysid_btr.effects.encoder_offset import EncoderOffset
+from sysid_btr.effects.gravity_tilt import GravityTilt
+from sysid_btr.effects.integral_gain import IntegralGain
+from sysid_btr.effects.joint_compliance import JointCompliance
+from sysid_btr.effects.joint_spring import JointSpring
+from sysid_btr.effects.payload import Payload
+from sysid_btr.effects.quadratic_damping import QuadraticDamping
+from sysid_btr.effects.slew_limit import SlewLimit
+from sysid_btr.effects.speed_torque_limit import SpeedTorqueLimit
+from sysid_btr.effects.torque_limit import TorqueLimit
+from sysid_btr.effects.viscous_damping import ViscousDamping
+from sysid_btr.identify.study import make_study
+from sysid_btr.io.log import Log
+from sysid_btr.io.parquet import read_log
+from sysid_btr.models.robot import load_robot
+from sysid_btr.replay.engine import Numerics
+
+SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
+GAINS = ("kp:*=shared", "kv:*=shared")
+LEG_FIT = ("mass:HipPitch,KneePitch", *GAINS)
+PENDULUM_FIT = ("mass:*", *GAINS)
+AMOUNT = 0.15
+"""Relative error of an amount that is right even where its interval is narrower."""
+
+# --- logs from another simulator --------------------------------------------------------------------------
+
+
+@lru_cache
+def sample(name: str) -> Closing:
+    model = name.split("_")[0]
+    fit = {"leg": LEG_FIT, "pendulum": PENDULUM_FIT, "nao": ("mass:RKneePitch,LHipPitch", *GAINS)}[model]
+    log = read_log(SAMPLES / f"{name}.parquet")
+    return close(make_study(load_robot(str(SAMPLES / f"{model}.xml")), [log]), fit)
+
+
+def truth(name: str) -> dict[str, Any]:
+    (planted,) = json.loads((SAMPLES / f"{name}.truth.json").read_text())["effects"]
+    return dict(planted)
+
+
+def only_effect(found: Closing) -> NamedEffect:
+    assert len(found.effects) == 1, found.message
+    return found.effects[0]
+
+
+def amount_is(effect: NamedEffect, kind: int, true: float) -> bool:
+    estimate = effect.parameters[kind]
+    inside = estimate.ci95[0] <= true <= estimate.ci95[1]
+    return inside or abs(estimate.value - true) <= AMOUNT * abs(true)
+
+
+def over_floor(found: Closing) -> float:
+    held_out = found.after.holdout["position"]
+    return held_out.rmse / held_out.floor
+
+
+@pytest.mark.parametrize("name", ["leg_clean", "pendulum_clean"])
+def test_nothing_is_named_where_nothing_is_missing(name: str) -> None:
+    found = sample(name)
+    assert found.verdict == "nothing_missing", found.message
+    assert found.effects == ()
+    assert over_floor(found) <= 1.1
+
+
+@pytest.mark.parametrize("name", ["leg_friction", "pendulum_friction"])
+def test_friction_is_found_at_its_joint(name: str) -> None:
+    found, planted = sample(name), truth(name)
+    effect = only_effect(found)
+    assert found.verdict == "explained", found.message
+    assert effect.effect == "coulomb_friction"
+    assert effect.where == tuple(planted["where"])
+    assert amount_is(effect, 0, planted["parameters"]["torque"]), effect
+    assert over_floor(found) <= 1.1
+    assert found.before.holdout["position"].rmse > 2 * found.after.holdout["position"].rmse
+
+
+def test_backlash_is_found_at_its_joint() -> None:
+    found, planted = sample("leg_backlash"), truth("leg_backlash")
+    effect = only_effect(found)
+    assert (effect.effect, effect.where) == ("backlash", tuple(planted["where"])), found.message
+    assert amount_is(effect, 0, planted["parameters"]["play"]), effect
+    assert over_floor(found) <= 1.3
+
+
+def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:
+    found = sample("leg_dropout")
+    assert found.verdict == "unexplained", found.message
+    assert found.effects == ()
+    assert found.signature is not None
+
+
+def test_a_weak_motor_is_found() -> None:
+    found, planted = sample("pendulum_weak"), truth("pendulum_weak")
+    effect = only_effect(found)
+    assert (effect.effect, effect.where) == ("speed_torque_limit", tuple(planted["where"])), found.message
+    assert amount_is(effect, 0, planted["parameters"]["stall"]), effect
+
+
+def test_a_delay_of_all_servos_is_one_delay_at_all_joints() -> None:
+    found, planted = sample("nao_delay"), truth("nao_delay")
+    effect = only_effect(found)
+    assert effect.effect == "command_delay", found.message
+    assert set(effect.where) == set(planted["where"])
+    assert amount_is(effect, 0, planted["parameters"]["delay"]), effect
+    assert over_floor(found) <= 1.1
+
+
+@pytest.mark.parametrize("name", ["leg_clean", "leg_friction", "leg_dropout", "pendulum_weak"])
+def test_every_step_and_candidate_is_recorded(name: str) -> None:
+    found = sample(name)
+    assert found.steps[0].added == ()
+    assert found.replays > 0
+    assert len(found.values) == sum(len(m.parameters) for m in found.modifiers)
+    if found.effects:
+        assert any(c.effect == found.effects[0].effect for c in found.candidates)
+        assert found.steps[-1].holdout < found.steps[0].holdout
+
+
+# --- one effect at a time, planted in a toy leg ------------------------------------------------------------
+
+OTHERWISE = Numerics("RK4", 0.00125)
+TICK = 2 * np.pi / 4096
+TOY_FIT = ("mass:knee", *GAINS)
+TRUE_MASS, TRUE_KP = 1.15, 0.95
+
+
+@dataclass(frozen=True)
+class Plant:
+    """An effect with its amounts; whether the servo's torque is logged; what it may honestly be taken for."""
+
+    effect: Effect
+    values: tuple[float, ...]
+    effort: bool = False
+    rivals: tuple[str, ...] = ()
+    tested: int | None = 0
+    """Kind whose amount must be right."""
+
+    def __str__(self) -> str:
+        return self.effect.name
+
+
+def motion(seconds: float = 8.0) -> Log:
+    """Commands with slow and fast parts, different at every joint, from rest."""
+    time = np.arange(round(seconds * 100) + 1) * 0.01
+    rng = np.random.default_rng(3)
+    fade = 1 - np.exp(-((time / 0.3) ** 2))
+    channels = {}
+    for joint in toys.LEG_JOINTS:
+        frequency = np.array([0.35, 0.7, 1.1, 1.7, 2.4, 3.3]) * rng.uniform(0.9, 1.1, 6)
+        phase = rng.uniform(0, 2 * np.pi, 6)
+        waves = 0.175 / np.sqrt(frequency) * np.sin(2 * np.pi * np.outer(time, frequency) + phase)
+        channels[f"command.{joint}"] = fade * waves.sum(axis=1)
+    return toys.make_log(time, channels, sample_period=0.01)
+
+
+def recorded(plant: Plant | None, seed: int = 0) -> Log:
+    """The leg with another mass and gain and the effect, seen by 12-bit encoders with noise."""
+    robot, log = toys.leg(), motion()
+    declared = make_study(robot, [log], numerics=toys.FINE).declare(("mass:knee", "kp:*=shared"))
+    effects = (plant.effect,) if plant else ()
+    values = [TRUE_MASS, TRUE_KP, *(plant.values if plant else ())]
+    effort = plant is not None and plant.effort
+    outputs = toys.run(robot, log, (*declared, *effects), values, OTHERWISE, effort=effort)
+    rng = np.random.default_rng(seed)
+    channels = dict(log.channels)
+    for i, joint in enumerate(toys.LEG_JOINTS):
+        noisy = outputs.position[0, :, i] + rng.normal(0, 4e-4, len(log))
+        channels[f"position.{joint}"] = np.round(noisy / TICK) * TICK
+        if effort:
+            assert outputs.effort is not None
+            torque = outputs.effort[0, :, i] + rng.normal(0, 0.01, len(log))
+            channels[f"effort.{joint}"] = np.round(torque / 0.005) * 0.005
+    return replace(log, channels=channels)
+
+
+def diagnose(plant: Plant | None) -> Closing:
+    return close(make_study(toys.leg(), [recorded(plant)]), TOY_FIT)
+
+
+KNEE = ("knee",)
+PLANTS = [
+    Plant(CoulombFriction(KNEE), (0.15,)),
+    Plant(ViscousDamping(KNEE), (0.15,), effort=True),
+    Plant(QuadraticDamping(KNEE), (0.06,)),
+    Plant(Armature(KNEE), (0.01,)),
+    Plant(CommandDelay(toys.LEG_JOINTS, shared=True), (0.025,)),
+    Plant(Backlash(KNEE), (0.03,)),
+    Plant(JointCompliance(KNEE), (0.03,), rivals=("backlash",)),
+    Plant(JointSpring(KNEE), (1.0, 0.3), rivals=("encoder_scale",)),
+    Plant(TorqueLimit(KNEE), (1.0,), rivals=("speed_torque_limit",)),
+    Plant(SpeedTorqueLimit(KNEE), (2.0, 6.0), rivals=("torque_limit",)),
+    Plant(SlewLimit(KNEE), (2.5,)),
+    Plant(IntegralGain(KNEE), (20.0,)),
+    Plant(Payload(("ankle",)), (0.15, 0.05, 0.0, -0.05), rivals=("com_offset",), tested=None),
+    Plant(ComOffset(("ankle",)), (0.03, 0.0, -0.03), rivals=("payload",), tested=None),
+    Plant(ConstantForce(KNEE), (0.2,), effort=True),
+    Plant(EncoderOffset(KNEE), (0.03,), effort=True, tested=None),
+    Plant(GravityTilt(("robot",)), (0.05, -0.08), rivals=("com_offset",), tested=1),
+]
+
+
+@pytest.mark.parametrize("plant", PLANTS, ids=str)
+def test_a_planted_effect_is_named_where_it_is(plant: Plant) -> None:
+    found = diagnose(plant)
+    assert found.verdict in ("explained", "ambiguous"), found.message
+    effect = only_effect(found)
+    named = {effect.effect, *effect.confused_with} if found.verdict == "ambiguous" else {effect.effect}
+    assert plant.effect.name in named, found.message
+    assert effect.effect in (plant.effect.name, *plant.rivals), found.message
+    assert set(effect.where) == set(plant.effect.places), found.message
+    if effect.effect == plant.effect.name and plant.tested is not None:
+        assert amount_is(effect, plant.tested, plant.values[plant.tested]), effect
+    assert over_floor(found) <= 1.15
+
+
+def test_the_toy_leg_without_a_planted_effect_misses_nothing() -> None:
+    found = diagnose(None)
+    assert found.verdict == "nothing_missing", found.message
+    assert found.effects == ()
