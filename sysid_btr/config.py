@@ -29,6 +29,7 @@ class StudyFile(BaseModel):
     set: dict[str, float] | None = None
     channels: str | list[str] | None = None
     estimator: str | None = None
+    distance: str | None = None
     max_evaluations: int | None = None
     seed: int | None = None
     threads: int | None = None
@@ -59,7 +60,7 @@ class StudyFile(BaseModel):
             "model": None if self.model is None else _beside(folder, self.model),
             **{
                 name: getattr(self, name)
-                for name in ("estimator", "max_evaluations", "seed", "threads", "out")
+                for name in ("estimator", "distance", "max_evaluations", "seed", "threads", "out")
             },
             "as_json": self.json_,
             "resume": self.resume,

@@ -71,6 +71,8 @@ def realistic(effect: type[Effect]) -> np.ndarray:
     }
     if label(effect) == "voltage_sag-time":
         return np.array([0.05])
+    if effect.variant in ("train", "drive_train"):
+        return np.array([1.0, 0.3, 0.05, 0.2])
     if effect.name in special:
         return np.array(special[effect.name])
     return np.array(effect.probes(SCALE)[-1][-1])

@@ -39,13 +39,15 @@ SHORTEST_PERIOD = 0.3
 """Seconds."""
 OUTLIER = 4.0
 """Times the usual size from which a torque of either sign counts as an event."""
+EVEN = 0.3
+"""Difference, relative to a pulse, below which pulses and gaps are equally far from no torque."""
 TRAIN_SHARE = 0.15
 """Share of the variance that a pulse train must explain to be proposed."""
 LINE_SHARE, LINE_CLEAR = 0.03, 8.0
 """Share of the variance that a spatial frequency must explain, alone and relative to the median one."""
 LINES = 2
-OWN_RHYTHM = 0.7
-"""Share of the command that repeats with a period, from which that period is the motion's own."""
+OWN_RHYTHM = 0.6
+"""Share of the velocity that repeats with a period, from which that period is the motion's own."""
 STRETCH = 0.5
 """Seconds that are predicted from the others when a dependence is weighed."""
 NEARLY = 0.07
@@ -182,12 +184,33 @@ def pulse_train(one: MissingTorque) -> Train | None:
     period, share = patterns.best_period(rest, one.time, SHORTEST_PERIOD)
     if share < TRAIN_SHARE or _rhythm_of_motion(one, period):
         return None
-    train = patterns.best_train(rest, one.time, period)
+    train = _upright(one, patterns.best_train(rest, one.time, period))
     return train if train.share >= TRAIN_SHARE else None
 
 
+def _upright(one: MissingTorque, train: Train) -> Train:
+    """The train or the gaps between its pulses: whichever leaves nothing where it is off.
+
+    Where a fitted constant torque has taken its share of both, the one that comes first.
+    """
+    gaps = Train(
+        start=(train.start + train.duration) % train.period,
+        duration=train.period - train.duration,
+        period=train.period,
+        height=-train.height,
+        share=train.share,
+    )
+    on = np.mod(one.time - train.start, train.period) < train.duration
+    if on.all() or not on.any():
+        return train
+    off, inside = abs(float(np.median(one.torque[~on]))), abs(float(np.median(one.torque[on])))
+    if abs(off - inside) < EVEN * abs(train.height):
+        return min(train, gaps, key=lambda t: t.start)
+    return train if off < inside else gaps
+
+
 def _rhythm_of_motion(one: MissingTorque, period: float) -> bool:
-    return patterns.repetition(one.command, one.time, period) > OWN_RHYTHM
+    return patterns.repetition(one.velocity, one.time, period) > OWN_RHYTHM
 
 
 def signature(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -> dict[str, Any]:
@@ -303,6 +326,7 @@ def _periodic(one: MissingTorque) -> dict[str, Any] | None:
     if share < TRAIN_SHARE:
         return None
     train = patterns.best_train(signal, one.time, period)
+    train = _upright(one, train) if same_sign else train
     on = np.mod(one.time - train.start, train.period) < train.duration
     inside = rest[on] if on.any() else rest
     return {
