@@ -8,7 +8,7 @@ FIND_PYTHON = for p in $(PYTHON) python3 python3.13 python3.12 python3.11 python
   && $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 \
   && echo $$p && exit 0; done; \
   echo "no Python 3.11 or newer with venv: install one, or say make PYTHON=/path/to/python3" >&2; exit 1
-PYTEST_FLAGS ?= -n 2 -q
+PYTEST_FLAGS ?= -n 2 --dist loadfile -q
 SOURCES := sysid_btr tests benchmarks sample_logs
 
 .PHONY: demo test lint types check dev format clean

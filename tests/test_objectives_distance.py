@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from toys import FINE, pendulum, position, swing
 
 from sysid_btr.errors import UsageError
 from sysid_btr.models.grammar import parse_parameters
@@ -16,7 +17,6 @@ from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
 from sysid_btr.replay.engine import Replay
-from tests.toys import FINE, pendulum, position, swing
 
 LABELS = st.lists(st.integers(0, 4), min_size=30, max_size=30)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, IntArray
 
 GROW = 1.25
 """Ratio of neighbouring pulse lengths that are tried."""
@@ -58,7 +58,7 @@ def best_box(signal: FloatArray, shortest: int) -> Box | None:
         return None
     sums = np.concatenate([[0.0], np.cumsum(signal - signal.mean())])
 
-    def gains(a: FloatArray, b: FloatArray) -> FloatArray:
+    def gains(a: IntArray, b: IntArray) -> FloatArray:
         length = np.maximum(b - a, 1)
         return np.where(b > a, (sums[b] - sums[a]) ** 2 * n / (length * np.maximum(n - length, 1)), 0.0)
 
@@ -66,20 +66,20 @@ def best_box(signal: FloatArray, shortest: int) -> Box | None:
     length = float(max(shortest, 1))
     while length < n / 3:
         whole = round(length)
-        a = np.arange(n - whole + 1)
+        a = np.arange(n - whole + 1, dtype=np.int64)
         gain = gains(a, a + whole)
         k = int(np.argmax(gain))
         if gain[k] > best:
             best, at = float(gain[k]), (k, k + whole)
         length = max(length * GROW, length + 1)
     reach = max((at[1] - at[0]) // 3, 2)
-    near_start = np.clip(np.arange(at[0] - reach, at[0] + reach + 1), 0, n - 1)
-    near_stop = np.clip(np.arange(at[1] - reach, at[1] + reach + 1), 1, n)
-    grid = gains(*np.meshgrid(near_start, near_stop, indexing="ij"))
-    i, k = np.unravel_index(int(np.argmax(grid)), grid.shape)
-    start, stop = int(near_start[i]), int(near_stop[k])
+    near_start = np.clip(np.arange(at[0] - reach, at[0] + reach + 1, dtype=np.int64), 0, n - 1)
+    near_stop = np.clip(np.arange(at[1] - reach, at[1] + reach + 1, dtype=np.int64), 1, n)
+    grid = gains(near_start[:, None], near_stop[None, :])
+    row, column = np.unravel_index(int(np.argmax(grid)), grid.shape)
+    start, stop = int(near_start[row]), int(near_stop[column])
     height = (sums[stop] - sums[start]) / (stop - start) * n / (n - (stop - start))
-    return Box(start, stop, float(height), float(grid[i, k]) / total)
+    return Box(start, stop, float(height), float(grid[row, column]) / total)
 
 
 def fold(signal: FloatArray, time: FloatArray, period: float, bins: int = BINS) -> tuple[FloatArray, FloatArray]:

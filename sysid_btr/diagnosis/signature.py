@@ -48,8 +48,10 @@ LINE_SHARE, LINE_CLEAR = 0.03, 8.0
 LINES = 2
 OWN_RHYTHM = 0.6
 """Share of the velocity that repeats with a period, from which that period is the motion's own."""
-STRETCH = 0.5
-"""Seconds that are predicted from the others when a dependence is weighed."""
+STRETCH, SHORT_STRETCH = 2.5, 0.5
+"""Seconds that are predicted from the others when a dependence on a state, and on time, is weighed."""
+MOSTLY = 0.5
+"""Share of the excess in one second from which the residual is an event, which a state hardly predicts."""
 NEARLY = 0.07
 """A simpler dependence is preferred if its share is within this of the best one's."""
 WEAK = 0.2
@@ -238,7 +240,7 @@ def signature(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -
     # one episode a joint: the one that shows most
     chosen = list({t.joint: t for t in reversed(loud)}.values())[::-1]
     total = sum(_blame(t) for t in chosen)
-    entries = []
+    entries: list[dict[str, Any]] = []
     for one in chosen[:DESCRIBED]:
         share = _blame(one) / max(total, 1e-300)
         if entries and share < 0.05:
@@ -255,30 +257,31 @@ def _blame(one: MissingTorque) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Feature:
-    """Something a missing torque may depend on: a name, words, and the functions tried; simplest first."""
+    """Something a missing torque may depend on: a name, words, functions of it (n, k), whether it is time."""
 
     name: str
     words: str
     design: FloatArray
+    of_time: bool = False
 
 
 def _describe(one: MissingTorque, torques: Sequence[MissingTorque]) -> dict[str, Any]:
     rms = float(np.std(one.torque))
     real = max(rms**2 - one.noise**2, 0.05 * rms**2)
     periodic = _periodic(one)
-    block = max(round(STRETCH / one.period), 1)
     together = -(-len(one.torque) // 4096)
     rows = slice(None, None, together)
     features = list(_features(one, torques, periodic))
     shares = []
     for feature in features:
         seen = one.seen(feature.design)[rows]
-        share = predicted_share(one.torque[rows], seen, max(block // together, 1))
+        block = (SHORT_STRETCH if feature.of_time else STRETCH) / (one.period * together)
+        share = predicted_share(one.torque[rows], seen, max(round(block), 1))
         shares.append(float(np.clip(share * rms**2 / real, 0.0, 1.0)))
     best = max(shares)
     chosen = next(i for i, s in enumerate(shares) if s >= best - NEARLY)
     localised = _localised(one)
-    known = best >= WEAK
+    known = best >= (MOSTLY if localised["share"] > MOSTLY else WEAK)
     drift = _gain_rhythm(one) if known and features[chosen].name == "torque_and_time" else None
     words = _words(one, rms, localised, periodic, features[chosen] if known else None, drift)
     return {
@@ -355,12 +358,9 @@ def _features(
     yield _Feature("position", "the position", of(q, 10))
     yield _Feature("acceleration", "the acceleration", of(one.acceleration, 6))
     yield _Feature("command_rate", "the rate of the command", of(np.gradient(one.command, one.period), 7))
-    for line in spatial_lines(one)[:1]:
-        pair = np.column_stack([np.sin(line.number * q), np.cos(line.number * q)])
-        yield _Feature("fine_position", f"the position, {line.number:.3g} rad per unit", pair)
     patch = hats(q, np.linspace(q.min(), q.max(), 14))
     yield _Feature(
-        "position_and_direction", "the position, against the motion", np.column_stack([sign[:, None] * patch])
+        "position_and_direction", "the position, against the motion", sign[:, None] * patch
     )
     for other in torques:
         if other.episode == one.episode and other.joint != one.joint:
@@ -371,12 +371,17 @@ def _features(
         count = int(np.clip(2 * periodic["period"] / max(periodic["duration"], one.period), 10, 40))
         beat = hats(phase, np.linspace(0, 1, count))
         again = f"the time within a period of {periodic['period']:.3g} s"
-        yield _Feature("phase", again, beat)
-        yield _Feature("torque_and_phase", f"the servo's torque and {again}", beat * one.servo_measured[:, None])
+        yield _Feature("phase", again, beat, True)
+        yield _Feature("torque_and_phase", f"the servo's torque and {again}", beat * one.servo_measured[:, None], True)
     knots = np.linspace(one.time[0], one.time[-1], int(np.clip((one.time[-1] - one.time[0]) / 1.5, 3, 25)))
     slow = hats(one.time, knots)
-    yield _Feature("time", "time alone, slowly", slow)
-    yield _Feature("torque_and_time", "the servo's torque, by a gain that drifts", slow * load[:, None])
+    yield _Feature("time", "time alone, slowly", slow, True)
+    yield _Feature("torque_and_time", "the servo's torque, by a gain that drifts", slow * load[:, None], True)
+    # the frequency is chosen on all data: it has to beat time as well
+    for line in spatial_lines(one)[:1]:
+        pair = np.column_stack([np.sin(line.number * q), np.cos(line.number * q)])
+        length = f"{2 * np.pi / line.number:.3g} {'m' if one.unit == 'N' else 'rad'}"
+        yield _Feature("fine_position", f"the position, again every {length}", pair)
 
 
 def _gain_rhythm(one: MissingTorque) -> float | None:
@@ -404,13 +409,13 @@ def _words(
     text = f"a torque at {one.joint} of {rms:.2g} {one.unit} rms"
     if one.unit == "N":
         text = text.replace("torque", "force")
-    if localised["share"] > 0.5:
+    if localised["share"] > MOSTLY:
         text += f", {100 * localised['share']:.0f} % of its trace in the second after t = {localised['start']:.3g} s"
     elif periodic is not None and (feature is None or feature.name.endswith("phase")):
         kind = "" if periodic["same_sign"] else " of either sign"
         text += (
             f", in pulses{kind} of {periodic['amplitude']:.2g} {one.unit} and {periodic['duration']:.2g} s"
-            f" every {periodic['period']:.4g} s, the first at {periodic['start']:.3g} s"
+            f" every {periodic['period']:.4g} s (one at {periodic['start']:.3g} s)"
         )
     if feature is None:
         return text + ", which no state of the robot predicts"

@@ -202,7 +202,7 @@ def _deconvolve(
             episode=number,
             unit=scale_at(scales, joint).unit("Nm"),
             period=clock.period,
-            time=(np.arange(len(error)) * clock.period)[keep],
+            time=clock.period * np.arange(len(error), dtype=np.float64)[keep],
             torque=torque[keep, k],
             noise=float(noise[k]),
             residual=(error[:, k] / target.noise[k])[keep],
@@ -289,6 +289,7 @@ def _wiener(error: FloatArray, response: FloatArray, floor: FloatArray) -> _Inve
         prior = np.mean(np.abs(spectrum) ** 2 / size + spread, axis=0)
     torque = np.fft.irfft(spectrum, size, axis=0)[:n]
     seen = posterior @ gram
-    noise = np.sqrt(np.mean(np.einsum("fij,fji->fi", seen, posterior).real, axis=0))
+    filters = np.abs(posterior @ hermitian) ** 2
+    noise = np.sqrt(np.mean(filters @ (floor / sigma) ** 2, axis=0))
     gain = np.clip(np.einsum("fii->fi", seen).real, 0.0, 1.0)
-    return _Inverse(torque, noise, np.fft.rfftfreq(size), gain)
+    return _Inverse(torque, noise, np.asarray(np.fft.rfftfreq(size), dtype=np.float64), gain)

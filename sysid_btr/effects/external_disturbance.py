@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.effects.base import Effect, Probe
-from sysid_btr.models.modifier import Kind, Rig
+from sysid_btr.models.modifier import Kind, Parameter, Rig
 from sysid_btr.models.scales import JointScale
 
 
@@ -45,6 +45,10 @@ class ExternalDisturbance(Effect):
     def probe_at(cls, scale: JointScale, start: float, duration: float) -> Probe:
         """A probe at a time that the residual proposes."""
         return ((0.1 * scale.torque_rms, start, duration),)
+
+    def around(self, values: FloatArray) -> Self:
+        """The same with times bounded near a guess (parameters,), so that a fit can refine them."""
+        return replace(self, known=_near(self.parameters, values, len(self.kinds)))
 
     def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray:
         torque = np.zeros((rig.size, len(time) - 1, len(rig.index.joints)))
@@ -84,6 +88,10 @@ class ExternalDisturbanceTrain(Effect):
     def probe_at(cls, scale: JointScale, start: float, duration: float, period: float) -> Probe:
         """A probe at times that the residual proposes."""
         return ((0.1 * scale.torque_rms, start, duration, period),)
+
+    def around(self, values: FloatArray) -> Self:
+        """The same with times bounded near a guess (parameters,), so that a fit can refine them."""
+        return replace(self, known=_near(self.parameters, values, len(self.kinds)))
 
     def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray | None:
         torque = np.zeros((rig.size, len(time) - 1, len(rig.index.joints)))
@@ -140,3 +148,23 @@ def pulses(values: FloatArray, time: FloatArray) -> FloatArray:
 
     done = elapsed(time[None])
     return np.asarray(amount * np.diff(done, axis=1) / np.diff(time))
+
+
+def _near(parameters: tuple[Parameter, ...], values: FloatArray, kinds: int) -> tuple[Parameter, ...]:
+    """Parameters whose bounds on times are as narrow as the guess of a pulse allows.
+
+    A fit takes its finite differences as fractions of the bounds: within bounds of a whole log the start of
+    a pulse would be displaced by more than the pulse.
+    """
+    result = []
+    for i, parameter in enumerate(parameters):
+        place, kind = divmod(i, kinds)
+        duration = float(values[place * kinds + 2])
+        value = float(values[i])
+        reach = (None, max(0.5 * duration, 0.05), 0.7 * duration, min(0.02 * value, 0.25 * duration))[kind]
+        if reach is not None:
+            low, high = max(value - reach, parameter.lower), min(value + reach, parameter.upper)
+            nominal = min(max(parameter.nominal, low), high)
+            parameter = replace(parameter, nominal=nominal, lower=low, upper=high)
+        result.append(parameter)
+    return tuple(result)

@@ -131,11 +131,12 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
 def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitted]:
     """Refit with inflated noise until the columns' errors settle."""
     for _ in range(rounds):
-        before = fitted.misfit
+        before = fitted.train_columns
         study = inflate(study, fitted)
         again = refit(study, fitted.modifiers, fitted.values)
         fitted = replace(again, evaluations=again.evaluations + fitted.evaluations)
-        if abs(before - fitted.misfit) < 0.02 * len(fitted.columns):
+        # held-out data must not decide how long is fitted
+        if np.all(np.abs(np.log(fitted.train_columns / before)) < 0.02):
             break
     study = inflate(study, fitted)
     return study, judge(study, fitted.modifiers, fitted.values, fitted.evaluations)
