@@ -101,7 +101,7 @@ def make_targets(
                 mask=mask[:, live],
             )
         )
-    if not any(t.channel == "position" for t in targets):
+    if not targets:
         have = ", ".join(log.joints("position")) or "none"
         raise ModelError(
             f"log {log.path or ''}: no measured position belongs to a joint of the model. "
