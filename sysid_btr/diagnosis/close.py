@@ -441,8 +441,8 @@ def _merge(study: Study, state: _State, declared: tuple[Modifier, ...]) -> _Stat
         main = amounts[:, kind.main]
         middle = float(np.median(main))
         even = len(found) > 2 and bool(np.all(np.abs(main - middle) <= EVEN_SPREAD * abs(middle)))
-        merged.append(kind.at(places, study.scales, shared=even))
         values.append(np.median(amounts, axis=0) if even else amounts.ravel())
+        merged.append(kind.at(places, study.scales, shared=even).around(values[-1]))
     modifiers = (*declared, *merged)
     fitted = replace(state.fitted, modifiers=modifiers, values=np.concatenate(values))
     # what is in the model beside an effect is not its rival

@@ -47,7 +47,7 @@ class Hypothesis:
         return len(self.start)
 
     def modifier(self, scales: Scales) -> Effect:
-        return self.effect.at(self.places, scales, shared=self.shared)
+        return self.effect.at(self.places, scales, shared=self.shared).around(self.start)
 
     def __str__(self) -> str:
         places = ", ".join(self.places) if len(self.places) < 5 else f"{len(self.places)} places"

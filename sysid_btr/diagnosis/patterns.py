@@ -17,7 +17,7 @@ BINS = 40
 REPEATS = 4
 """Times that a period must fit into a signal."""
 MOST_PERIODS = 6000
-SHORTER = 0.85
+SHORTER = 0.8
 """A shorter period is preferred if it explains at least this fraction of what the best one does."""
 
 

@@ -37,7 +37,7 @@ CLEAR = 50.0
 SHORTEST_PULSE = 0.02
 SHORTEST_PERIOD = 0.3
 """Seconds."""
-OUTLIER = 4.0
+OUTLIER = 3.0
 """Times the usual size from which a torque of either sign counts as an event."""
 EVEN = 0.3
 """Difference, relative to a pulse, below which pulses and gaps are equally far from no torque."""
@@ -409,9 +409,10 @@ def _words(
     text = f"a torque at {one.joint} of {rms:.2g} {one.unit} rms"
     if one.unit == "N":
         text = text.replace("torque", "force")
-    if localised["share"] > MOSTLY:
+    beats = feature is not None and feature.name.endswith("phase")
+    if localised["share"] > MOSTLY and not beats:
         text += f", {100 * localised['share']:.0f} % of its trace in the second after t = {localised['start']:.3g} s"
-    elif periodic is not None and (feature is None or feature.name.endswith("phase")):
+    elif periodic is not None and (feature is None or beats):
         kind = "" if periodic["same_sign"] else " of either sign"
         text += (
             f", in pulses{kind} of {periodic['amplitude']:.2g} {one.unit} and {periodic['duration']:.2g} s"

@@ -104,6 +104,10 @@ class Effect(Modifier):
                 )
         return replace(bare, known=tuple(known))
 
+    def around(self, values: FloatArray) -> Effect:
+        """The effect with bounds narrowed to where a search from these values makes sense."""
+        return self
+
     @property
     def neutral(self) -> FloatArray:
         """(parameters,) values at which the model is exactly the plain one."""
