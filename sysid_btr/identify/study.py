@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -167,9 +166,7 @@ def make_study(
 
 def split_episodes(log: Log) -> list[Log]:
     """Each episode of a log as a log of its own."""
-    borders = np.flatnonzero(np.diff(log.episode) != 0) + 1
-    edges = [0, *borders.tolist(), len(log)]
-    return [log.window(a, b) for a, b in pairwise(edges) if b - a > 1]
+    return [log.window(rows.start, rows.stop) for rows in log.episodes() if rows.stop - rows.start > 1]
 
 
 def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, threads: int = 0) -> Scales:
