@@ -20,20 +20,24 @@ if TYPE_CHECKING:
 
 METADATA_KEY = b"sysid_btr"
 _MAGIC = b"PAR1"
+TEXT, UNKNOWN = "a text or CSV file", "something else"
 _EXAMPLE_META = '{"schema": 1, "robot": "nao", "mount": "fixed", "source": "measured"}'
 _TIME_NAMES = ("t", "timestamp", "stamp", "time_s", "seconds", "sec")
-# First bytes of what people hand over by mistake, and how to call it.
+_IMPORT = "convert it with `sysid-btr import`, or write a Parquet log (schema 1) yourself"
+_AS_TABLE = "write its columns as CSV or Parquet, and convert that with `sysid-btr import`"
+_ROS1 = "make it a ROS 2 bag with `rosbags-convert`, and convert that with `sysid-btr import`"
+# First bytes of what people hand over by mistake, how to call it, and what to do with it.
 _SIGNATURES = (
-    (b"\x89HDF", "an HDF5 file"),
-    (b"PK\x03\x04", "a zip archive or .npz file"),
-    (b"\x93NUMPY", "a .npy file"),
-    (b"\x1f\x8b", "a gzip file"),
-    (b"#ROSBAG", "a ROS 1 bag"),
-    (b"\x89MCAP", "an MCAP file"),
-    (b"SQLite format 3", "a SQLite file or ROS 2 bag"),
-    (b"ARROW1", "an Arrow IPC (Feather) file"),
-    (b"<", "an XML file"),
-    (b"{", "a JSON file"),
+    (b"\x89HDF", "an HDF5 file", _AS_TABLE),
+    (b"PK\x03\x04", "a zip archive or .npz file", _AS_TABLE),
+    (b"\x93NUMPY", "a .npy file", _AS_TABLE),
+    (b"\x1f\x8b", "a gzip file", _IMPORT),
+    (b"#ROSBAG", "a ROS 1 bag", _ROS1),
+    (b"\x89MCAP", "an MCAP file", _IMPORT),
+    (b"SQLite format 3", "a SQLite file or ROS 2 bag", _IMPORT),
+    (b"ARROW1", "an Arrow IPC (Feather) file", _AS_TABLE),
+    (b"<", "an XML file", _AS_TABLE),
+    (b"{", "a JSON file", _AS_TABLE),
 )
 
 
@@ -91,7 +95,10 @@ def _unreadable(path: Path) -> Problem | None:
         )
     if not path.is_file():
         return problem(
-            "file.not_a_file", "this is a folder, not a log", "give one Parquet file, --log once for each"
+            "file.not_a_file",
+            "this is a folder, not a log",
+            "give one Parquet file, --log once for each; "
+            "a ROS 2 bag or a LeRobot dataset is converted with `sysid-btr import`",
         )
     try:
         size = path.stat().st_size
@@ -114,14 +121,16 @@ def _unreadable(path: Path) -> Problem | None:
             "it was cut short, or the recorder did not close it",
             "copy it again, or close the recorder properly; the footer cannot be rebuilt",
         )
-    kind = next((name for start, name in _SIGNATURES if head.startswith(start)), None)
-    if kind is None:
-        kind = "a text or CSV file" if _is_text(head) else "something else"
-    return problem(
-        "file.not_parquet",
-        f"this is not a Parquet file: it looks like {kind}",
-        "convert it with `sysid-btr import`, or write a Parquet log (schema 1) yourself",
-    )
+    kind, remedy = looks_like(head)
+    return problem("file.not_parquet", f"this is not a Parquet file: it looks like {kind}", remedy)
+
+
+def looks_like(head: bytes) -> tuple[str, str]:
+    """What a file that is not Parquet seems to be, by its first bytes, and what to do with it."""
+    for start, name, remedy in _SIGNATURES:
+        if head.startswith(start):
+            return name, remedy
+    return (TEXT, _IMPORT) if _is_text(head) else (UNKNOWN, _AS_TABLE)
 
 
 def _is_text(head: bytes) -> bool:
