@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sysid_btr.report.changes import model_lines
 from sysid_btr.report.text import compact, number, stages, told
 from sysid_btr.units import si, si_all, with_digits_of
 
@@ -44,6 +45,7 @@ def render(result: Mapping[str, Any], overlay: bytes | None = None, overlay_dark
         ],
         overlay=None if overlay is None else _data_uri(overlay),
         overlay_dark=None if overlay_dark is None else _data_uri(overlay_dark),
+        changes=list(model_lines(result)),
         raw=json.dumps(result, ensure_ascii=False),
     )
 

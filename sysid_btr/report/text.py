@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
+from sysid_btr.report.changes import model_lines
 from sysid_btr.units import si_all, with_digits_of
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         for p in estimates:
             if p["reason"]:
                 yield Text(f"  {p['name']}: {told(p)}: {p['reason']}")
+    yield from (Text(line) for line in model_lines(result))
     if result.get("verdict") in ("ambiguous", "unexplained") and result.get("candidates"):
         yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
     if result.get("signature"):
@@ -71,6 +73,7 @@ def stages(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     names = {
         "replay": [("nominal", "replayed")],
         "fit": [("nominal", "plain model"), ("before", "fitted")],
+        "posterior": [("nominal", "plain model"), ("before", "posterior mean")],
         "close": [("nominal", "plain model"), ("before", "parameters fitted"), ("after", "effects added")],
     }
     return names[result["kind"]]

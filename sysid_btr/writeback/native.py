@@ -1,0 +1,236 @@
+"""What MuJoCo's own elements hold of modifiers that change more than fields, and what they cannot hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import ceil
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.effects.command_delay import CommandDelay
+from sysid_btr.effects.constant_force import ConstantForce
+from sysid_btr.effects.encoder_offset import EncoderOffsetInLoop
+from sysid_btr.effects.payload import Payload
+from sysid_btr.models.fields import ConstantForce as ConstantForceField
+from sysid_btr.models.fields import Delay
+from sysid_btr.models.modifier import Modifier, Rig
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from sysid_btr.replay.engine import Numerics
+
+Held = Literal["yes", "approximately", "no"]
+SOFT = 1e-10
+"""Stiffness, relative to its torque, 1/rad, of a spring so long that its torque is constant."""
+
+REASONS: Mapping[str, str] = {
+    "law": "a law of every time step",
+    "shape_command": "a change of the commands before they reach the servo",
+    "applied_torque": "a torque over time, from outside",
+    "initial_state": "where this log's replay starts",
+    "read_out": "a change of what the sensor shows",
+}
+"""Hook of a modifier -> what it is, where MJCF has no element for it."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A modifier as a file holds it.
+
+    Attributes
+    ----------
+    modifier, values : as replayed; values are (1, places, kinds).
+    stand_in : what writes it into a model in the file's way, None for what leaves no trace.
+    held : whether the file then moves as the replay did.
+    how : what the file has in its place, or why it has not, in words.
+    """
+
+    modifier: Modifier
+    values: FloatArray
+    stand_in: Modifier | None
+    held: Held
+    how: str
+
+
+def part_of(modifier: Modifier, values: FloatArray, numerics: Numerics, later: tuple[Modifier, ...]) -> Part:
+    """How a file holds one modifier.
+
+    Parameters
+    ----------
+    modifier, values : as replayed.
+    numerics : integrator and step of the file.
+    later : modifiers that act after it.
+    """
+    native = NATIVE.get(type(modifier))
+    found = None if native is None else native(modifier, values[0], numerics, later)
+    if found is not None:
+        stand_in, held, how = found
+        return Part(modifier, values, stand_in, held, how)
+    hooks = [reason for hook, reason in REASONS.items() if type(modifier).overrides(hook)]
+    if not hooks:
+        return Part(modifier, values, modifier, "yes", "")
+    fields = type(modifier).overrides("write_fields") or type(modifier).overrides("edit_spec")
+    return Part(modifier, values, modifier if fields else None, "no", " and ".join(hooks))
+
+
+Found = tuple[Modifier | None, Held, str] | None
+
+
+@dataclass(frozen=True)
+class AddedBody(Modifier):
+    """A payload as a body of its own, welded to the one that carries it."""
+
+    loads: tuple[tuple[float, ...], ...] = ()
+
+    name: ClassVar[str] = "payload"
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        for place, (mass, *where) in zip(self.places, self.loads, strict=True):
+            if mass > 0:
+                body = spec.body(place).add_body(name=f"payload_{place}", pos=list(where))
+                body.explicitinertial = True
+                body.ipos, body.inertia = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        # not in the spec: what the compiler derives from masses, such as dampings, is that of the bare robot
+        for place, (mass, *_) in zip(self.places, self.loads, strict=True):
+            if mass > 0:
+                rig.array("body_mass")[:, rig.model.body(f"payload_{place}").id] = mass
+
+
+def _payload(modifier: Modifier, values: FloatArray, _: Numerics, later: tuple[Modifier, ...]) -> Found:
+    if any(set(modifier.places) & set(m.places) and m.name in BODY_FIELDS for m in later):
+        return None  # what follows changes body and load together
+    loads = tuple(tuple(float(x) for x in row) for row in values)
+    return AddedBody(places=modifier.places, loads=loads), "yes", "a body of its own"
+
+
+BODY_FIELDS = ("mass", "com", "inertia", "com_offset", "payload")
+
+
+@dataclass(frozen=True)
+class ActuatorDelay(Modifier):
+    """Delay of commands by MuJoCo's own buffer.
+
+    A held command that is delayed by a fraction of a step counts with its mean over each step; linear
+    interpolation in the buffer is just that. Runge-Kutta reads the buffer within the step as well: there half
+    a step more keeps the mean, and what is left is of second order in the step.
+    """
+
+    delays: tuple[float, ...] = ()
+    timestep: float = 0.0
+
+    name: ClassVar[str] = "delay"
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        import mujoco
+
+        for place, delay in zip(self.places, self.delays, strict=True):
+            if delay <= 0:
+                continue
+            for actuator in spec.actuators:
+                if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == place:
+                    actuator.delay += delay
+                    actuator.nsample = ceil(actuator.delay / self.timestep - 1e-9) + 1
+                    actuator.interp = 1
+
+
+def _delay(modifier: Modifier, values: FloatArray, numerics: Numerics, later: tuple[Modifier, ...]) -> Found:
+    if any(_reshapes(m) and set(m.places) & set(modifier.places) for m in later):
+        return None
+    stated = [_buffered(float(d), numerics) for d in values[:, 0]]
+    if not any(delay for delay, _ in stated):
+        return None
+    stand_in = ActuatorDelay(places=modifier.places, delays=tuple(d for d, _ in stated), timestep=numerics.timestep)
+    if all(exact for _, exact in stated):
+        return stand_in, "yes", "the actuator's own delay"
+    how = "the actuator's own delay, to the whole step where it is shorter than one and a half"
+    if numerics.integrator == "RK4":
+        how += ", and else half a step longer, because RK4 reads it within the step as well"
+    return stand_in, "approximately", how
+
+
+def _reshapes(modifier: Modifier) -> bool:
+    """Whether it changes commands in a way that does not commute with a delay, as a constant shift does."""
+    return type(modifier).overrides("shape_command") and not isinstance(modifier, EncoderOffsetInLoop)
+
+
+def _buffered(delay: float, numerics: Numerics) -> tuple[float, bool]:
+    """The delay to state, and whether it does just what the replay did; a buffer knows no newer than a step ago."""
+    h = numerics.timestep
+    if delay == 0 or abs(delay - h) < 1e-9 * h:
+        return (h if delay else 0.0), True
+    if numerics.integrator != "RK4" and delay > h:
+        return delay, True
+    if delay >= 1.5 * h:
+        return delay + 0.5 * h, False
+    return (h if delay >= 0.5 * h else 0.0), False
+
+
+@dataclass(frozen=True)
+class SoftSpring(Modifier):
+    """A constant torque as a spring that is too long to notice the motion."""
+
+    torques: tuple[float, ...] = ()
+
+    name: ClassVar[str] = "constant_force"
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        stiffness, rest = rig.array("jnt_stiffness"), rig.array("qpos_spring")
+        for place, torque in zip(self.places, self.torques, strict=True):
+            joint = rig.model.joint(place).id
+            at = int(rig.model.jnt_qposadr[joint])
+            k = float(stiffness[0, joint])
+            if k == 0:
+                stiffness[:, joint] = k = SOFT * abs(torque)
+                rest[:, at] = 0.0
+            if torque:
+                rest[:, at] += torque / k
+
+
+def _constant(modifier: Modifier, values: FloatArray, _: Numerics, later: tuple[Modifier, ...]) -> Found:
+    if any(m.name in ("stiffness", "joint_spring") for m in later):
+        return None
+    torques = tuple(float(t) for t in values[:, 0])
+    how = "a spring on the joint, so soft and so long that its torque is constant"
+    return SoftSpring(places=modifier.places, torques=torques), "yes", how
+
+
+@dataclass(frozen=True)
+class ShiftedJoint(Modifier):
+    """A joint whose angle is what its encoder shows: the zero of the angle is shifted, not the robot."""
+
+    offsets: tuple[float, ...] = ()
+
+    name: ClassVar[str] = "encoder_offset"
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        zero, rest, limits = rig.array("qpos0"), rig.array("qpos_spring"), rig.array("jnt_range")
+        for place, offset in zip(self.places, self.offsets, strict=True):
+            joint = rig.model.joint(place).id
+            at = int(rig.model.jnt_qposadr[joint])
+            zero[:, at] += offset
+            rest[:, at] += offset
+            if rig.model.jnt_limited[joint]:
+                limits[:, joint] += offset
+
+
+def _reference(modifier: Modifier, values: FloatArray, _: Numerics, later: tuple[Modifier, ...]) -> Found:
+    if any(m.name in ("joint_spring", "encoder_scale") for m in later):
+        return None
+    offsets = tuple(float(b) for b in values[:, 0])
+    return ShiftedJoint(places=modifier.places, offsets=offsets), "yes", "the joint's reference angle"
+
+
+Native = Callable[["Modifier", FloatArray, "Numerics", "tuple[Modifier, ...]"], Found]
+NATIVE: Mapping[type[Modifier], Native] = {
+    Payload: _payload,
+    CommandDelay: _delay,
+    Delay: _delay,
+    ConstantForce: _constant,
+    ConstantForceField: _constant,
+    EncoderOffsetInLoop: _reference,
+}
+"""Modifiers for which MuJoCo has an element of its own, though the replay goes another way."""

@@ -1,0 +1,140 @@
+"""Reading ``params.json``: the parameters of a finished run, to start from or to replay at."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.errors import UsageError
+from sysid_btr.models.modifier import Modifier, Parameter
+from sysid_btr.session import PARAMS
+
+if TYPE_CHECKING:
+    from sysid_btr.models.robot import Robot
+    from sysid_btr.replay.engine import Numerics
+
+PARAMS_SCHEMA = "sysid_btr.params/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Params:
+    """What a run found, ready to be replayed.
+
+    Attributes
+    ----------
+    modifiers, values : the model, effects included.
+    numerics : with which it was replayed.
+    """
+
+    modifiers: tuple[Modifier, ...]
+    values: FloatArray
+    numerics: Numerics
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        """Parameter name -> value."""
+        names = (p.name for m in self.modifiers for p in m.parameters)
+        return dict(zip(names, (float(v) for v in self.values), strict=True))
+
+
+def read_params(path: Path, robot: Robot) -> Params:
+    """Read ``params.json``, or the one in a folder.
+
+    Raises
+    ------
+    UsageError
+        If it cannot be read, or names what this robot or this version does not have; all of it at once.
+    """
+    from sysid_btr.replay.engine import Numerics
+
+    file = path / PARAMS if path.is_dir() else path
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"--params {file}: {error.strerror}; give the params.json of a finished run") from error
+    except ValueError as error:
+        raise UsageError(f"--params {file} is not JSON ({error}); give the params.json of a finished run") from error
+    if not isinstance(content, dict) or content.get("schema") != PARAMS_SCHEMA:
+        raise UsageError(f"--params {file} is no parameter file ({PARAMS_SCHEMA}); give the params.json of a run")
+    problems: list[str] = []
+    modifiers: list[Modifier] = []
+    values: list[float] = []
+    try:
+        places = _places(robot)
+        for entry in content["modifiers"]:
+            modifier = _modifier(entry, places, problems)
+            if modifier is not None:
+                modifiers.append(modifier)
+                values += [float(p["value"]) for p in entry["parameters"]]
+        numerics = Numerics(str(content["numerics"]["integrator"]), float(content["numerics"]["timestep"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UsageError(
+            f"--params {file} was changed and cannot be read: {error!r}; give one as it was written"
+        ) from error
+    if problems:
+        raise UsageError(f"--params {file}:\n" + "\n".join(f"  {p}" for p in problems))
+    return Params(tuple(modifiers), np.array(values), numerics)
+
+
+def _places(robot: Robot) -> Mapping[str, Sequence[str]]:
+    from sysid_btr.models.robot import body_names, joint_names, servo_joints
+
+    return {
+        "body": body_names(robot),
+        "joint": joint_names(robot),
+        "servo": servo_joints(robot),
+        "robot": ("robot",),
+    }
+
+
+def _modifier(entry: Mapping[str, Any], places: Mapping[str, Sequence[str]], problems: list[str]) -> Modifier | None:
+    from sysid_btr.effects.library import EFFECTS
+    from sysid_btr.models.fields import FIELDS
+
+    name, variant, where = str(entry["name"]), str(entry["variant"]), tuple(entry["where"])
+    if entry["kind"] == "parameter":
+        found: Any = FIELDS.get(name)
+    else:
+        found = next((e for e in EFFECTS if (e.name, e.variant) == (name, variant)), None)
+    if found is None:
+        problems.append(f"this version has no {entry['kind']} {name} {variant}".rstrip())
+        return None
+    unknown = [p for p in where if p not in places[found.scope]]
+    if unknown:
+        problems.append(f"{name}: the model has no {found.scope} {', '.join(unknown)}")
+        return None
+    known = tuple(_parameter(p) for p in entry["parameters"])
+    modifier: Modifier = found(places=where, shared=bool(entry["shared"]), known=known)
+    return modifier
+
+
+def _parameter(entry: Mapping[str, Any]) -> Parameter:
+    low, high = (math.nan if b is None else float(b) for b in entry["bounds"])
+    return Parameter(
+        name=str(entry["name"]),
+        unit=str(entry["unit"]),
+        nominal=float(entry["nominal"]),
+        lower=-math.inf if math.isnan(low) else low,
+        upper=math.inf if math.isnan(high) else high,
+        scale=float(entry["scale"]),
+    )
+
+
+def starts_from(params: Params, parameters: Sequence[Parameter]) -> tuple[list[str], list[str]]:
+    """``NAME=VALUE`` for the parameters that are free here, and the names of those that are not."""
+    free = {p.name: p for p in parameters}
+    given, unused = [], []
+    for name, value in params.by_name.items():
+        if name in free:
+            p = free[name]
+            given.append(f"{name}={min(max(value, p.lower), p.upper)!r}")
+        else:
+            unused.append(name)
+    return given, unused

@@ -1,0 +1,127 @@
+"""The model that was replayed, as one compiled model: what a written file has to compile to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.models.modifier import Modifier, Rig
+from sysid_btr.models.robot import Robot
+from sysid_btr.replay.engine import Numerics, compile_model, make_index
+from sysid_btr.replay.quiet import quiet
+from sysid_btr.writeback.features import WRITTEN
+from sysid_btr.writeback.native import Part, part_of
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from sysid_btr.io.log import Log
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What to write.
+
+    Attributes
+    ----------
+    model : compiled, with its free joint even where the log's robot was held.
+    parts : every modifier as the file holds it.
+    fields : compiled fields that each part changes.
+    """
+
+    model: mujoco.MjModel
+    parts: tuple[Part, ...]
+    fields: tuple[frozenset[str], ...]
+
+
+def make_parts(robot: Robot, modifiers: Sequence[Modifier], values: FloatArray, numerics: Numerics) -> tuple[Part, ...]:
+    """How a file holds each modifier that is not neutral; those of the robot itself come first."""
+    everything = (*robot.always, *modifiers)
+    parts, column = [], 0
+    for i, modifier in enumerate(everything):
+        count = len(modifier.parameters)
+        own = values[column : column + count]
+        column += count
+        neutral = count > 0 and np.array_equal(own, [p.nominal for p in modifier.parameters])
+        if neutral and not type(modifier).overrides("edit_spec"):
+            continue
+        parts.append(part_of(modifier, modifier.spread(own[None]), numerics, everything[i + 1 :]))
+    return tuple(parts)
+
+
+def make_target(robot: Robot, log: Log, parts: Sequence[Part], numerics: Numerics) -> Target:
+    """Compile the robot with everything that a file can hold.
+
+    Parameters
+    ----------
+    robot : as configured for the log.
+    log : says whether the robot was held; some effects take their numerics from the model that was replayed.
+    parts, numerics : what is written.
+    """
+    import mujoco
+    from mujoco.batch import Batch
+
+    writing = tuple(p.stand_in for p in parts if p.stand_in is not None)
+    replayed = compile_model(robot, log, writing, numerics)
+    rig = Rig(replayed, Batch(replayed, 1, 1), make_index(replayed), numerics.timestep)
+    fields: list[frozenset[str]] = []
+    before: set[str] = set()
+    for part in parts:
+        rig.touched.clear()
+        if part.stand_in is not None:
+            part.stand_in.write_fields(rig, part.values)
+        fields.append(frozenset(rig.touched))
+        before |= rig.touched
+    model = replayed
+    if log.meta.mount == "fixed":
+        free = replace(log, meta=replace(log.meta, mount="free"))
+        model = compile_model(robot, free, writing, numerics)
+    for name in before:
+        _put(model, name, np.asarray(rig.batch.expanded(name)[0]))
+    with quiet():
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    held = tuple(_as_written(part, own) for part, own in zip(parts, fields, strict=True))
+    return Target(model, held, tuple(fields))
+
+
+def _as_written(part: Part, fields: frozenset[str]) -> Part:
+    """A part that changes what is not written is not in the file."""
+    more = sorted(fields - WRITTEN)
+    return replace(part, held="no", how=f"a change of {', '.join(more)}, which is not written") if more else part
+
+
+def _put(model: mujoco.MjModel, name: str, values: FloatArray) -> None:
+    """Write one field of a held robot's model into that of the free one, which has a free joint more."""
+    if name.startswith("opt."):
+        _assign(model.opt, name.removeprefix("opt."), values)
+        return
+    array = getattr(model, name)
+    if len(array) == len(values):
+        array[:] = values
+        return
+    array[_not_free(model, name.partition("_")[0])] = values
+
+
+def _not_free(model: mujoco.MjModel, kind: str) -> BoolArray:
+    """Rows of joints other than free ones, in a field by joint, by degree of freedom or by coordinate."""
+    import mujoco
+
+    free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
+    if kind == "jnt":
+        return np.asarray(~free)
+    size, address, width = (model.nv, model.jnt_dofadr, 6) if kind == "dof" else (model.nq, model.jnt_qposadr, 7)
+    keep = np.ones(size, dtype=bool)
+    for start in address[free]:
+        keep[start : start + width] = False
+    return keep
+
+
+def _assign(options: Any, name: str, values: FloatArray) -> None:
+    if np.ndim(getattr(options, name)):
+        getattr(options, name)[:] = values
+    else:
+        setattr(options, name, values.item())
