@@ -9,14 +9,14 @@ FIND_PYTHON = for p in $(PYTHON) python3 python3.13 python3.12 python3.11 python
   && echo $$p && exit 0; done; \
   echo "no Python 3.11 or newer with venv: install one, or say make PYTHON=/path/to/python3" >&2; exit 1
 PYTEST_FLAGS ?= -n 2 --dist loadfile -q
-SOURCES := sysid_btr tests benchmarks sample_logs
+SOURCES := sysid_btr tests benchmarks sample_logs notebooks
 
-.PHONY: demo test lint types check dev format clean
+.PHONY: demo test lint types check notebooks dev format clean
 
 demo: $(VENV)/installed
 	$(BIN)/sysid-btr demo
 
-test: dev lint types check
+test: dev lint types check notebooks
 
 dev: $(VENV)/installed-dev
 
@@ -28,6 +28,9 @@ types: $(VENV)/installed-dev
 
 check: $(VENV)/installed-dev
 	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+
+notebooks: $(VENV)/installed-dev
+	$(BIN)/python -m pytest --nbmake -p no:warnings -q notebooks
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix $(SOURCES)
