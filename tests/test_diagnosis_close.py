@@ -28,6 +28,7 @@ from sysid_btr.effects.joint_compliance import JointCompliance
 from sysid_btr.effects.joint_spring import JointSpring
 from sysid_btr.effects.payload import Payload
 from sysid_btr.effects.quadratic_damping import QuadraticDamping
+from sysid_btr.effects.sensor_delay import SensorDelay
 from sysid_btr.effects.slew_limit import SlewLimit
 from sysid_btr.effects.speed_torque_limit import SpeedTorqueLimit
 from sysid_btr.effects.torque_limit import TorqueLimit
@@ -194,12 +195,16 @@ def motion(seconds: float = 8.0) -> Log:
 
 def recorded(plant: Plant | None, seed: int = 0) -> Log:
     """The leg with another mass and gain and the effect, seen by 12-bit encoders with noise."""
-    robot, log = toys.leg(), motion()
+    return seen_by_encoders(plant, motion(), OTHERWISE, seed)
+
+
+def seen_by_encoders(plant: Plant | None, log: Log, numerics: Numerics, seed: int = 0) -> Log:
+    robot = toys.leg()
     declared = make_study(robot, [log], numerics=toys.FINE).declare(("mass:knee", "kp:*=shared"))
     effects = (plant.effect,) if plant else ()
     values = [TRUE_MASS, TRUE_KP, *(plant.values if plant else ())]
     effort = plant is not None and plant.effort
-    outputs = toys.run(robot, log, (*declared, *effects), values, OTHERWISE, effort=effort)
+    outputs = toys.run(robot, log, (*declared, *effects), values, numerics, effort=effort)
     rng = np.random.default_rng(seed)
     channels = dict(log.channels)
     for i, joint in enumerate(toys.LEG_JOINTS):
@@ -276,3 +281,51 @@ def test_the_toy_leg_without_a_planted_effect_misses_nothing() -> None:
     found = diagnose(None)
     assert found.verdict == "nothing_missing", found.message
     assert found.effects == ()
+
+
+# --- where and when it shows -------------------------------------------------------------------------------
+
+
+def test_an_effect_that_only_the_held_out_part_shows_is_found_by_fitting_more_of_the_log() -> None:
+    log = motion(16.0)
+    quiet = np.where(log.time < 11.5, 0.15, 1.0)
+    calm = replace(log, channels={name: quiet * values for name, values in log.channels.items()})
+    log = seen_by_encoders(Plant(TorqueLimit(KNEE), (1.0,)), calm, OTHERWISE)
+    found = close(make_study(toys.leg(), [log]), TOY_FIT)
+    effect = only_effect(found)
+    assert effect.effect in ("torque_limit", "speed_torque_limit"), found.message
+    assert effect.where == KNEE
+    assert found.study.split[0] > 11.5
+    assert found.study.split[0] <= 0.9 * 16.0
+    assert len(found.study.train[0]) < len(found.study.holdout[0])
+
+
+def test_a_late_sensor_is_told_from_a_late_command_by_the_joints_that_it_does_not_move() -> None:
+    plant = Plant(SensorDelay(("hip",)), (0.03,))
+    found = diagnose(plant)
+    effect = only_effect(found)
+    assert found.verdict == "explained", found.message
+    assert (effect.effect, effect.where) == ("sensor_delay", ("hip",))
+    assert amount_is(effect, 0, 0.03)
+
+
+def test_a_joint_that_friction_holds_is_not_taken_for_a_loose_one() -> None:
+    found = diagnose(Plant(CoulombFriction(KNEE), (2.2,)))
+    effect = only_effect(found)
+    assert effect.effect == "coulomb_friction", found.message
+    assert effect.where == KNEE
+    assert amount_is(effect, 0, 2.2)
+
+
+@pytest.mark.parametrize("planted", [False, True])
+def test_a_digital_servo_is_no_missing_effect(planted: bool) -> None:
+    """Torque computed every 4 ms and held; the plant itself goes on in between."""
+    plant = Plant(CoulombFriction(KNEE), (0.15,)) if planted else None
+    log = motion()
+    log = replace(log, meta=replace(log.meta, servo_period=0.004))
+    found = close(make_study(toys.leg(), [seen_by_encoders(plant, log, Numerics("RK4", 0.001, 0.004))]), TOY_FIT)
+    assert found.verdict == ("explained" if planted else "nothing_missing"), found.message
+    assert [e.effect for e in found.effects] == (["coulomb_friction"] if planted else [])
+    kp = next(p for p in found.parameters if p.name.startswith("kp"))
+    assert abs(kp.value - TRUE_KP) < 0.01 * TRUE_KP
+    assert found.study.numerics.servo_period == 0.004

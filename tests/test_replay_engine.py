@@ -187,6 +187,7 @@ def test_chunks_and_threads_give_the_same_bits(law: bool, monkeypatch: pytest.Mo
     wanted = run(leg(), LEG_LOG, modifiers, rows, threads=1, effort=True)
     for chunk, threads in ((32, 2), (7, 1), (70, 0)):
         monkeypatch.setattr(engine, "CHUNK", chunk)
+        monkeypatch.setattr(engine, "CHUNK_DOFS", 0)
         monkeypatch.setattr(engine, "SEGMENT", 11 * chunk)
         seen = run(leg(), LEG_LOG, modifiers, rows, threads=threads, effort=True)
         np.testing.assert_array_equal(seen.position, wanted.position)
@@ -412,3 +413,26 @@ def test_an_input_without_any_value_is_left_out() -> None:
     log = held(0.0, 0.1)
     empty = replace(log, channels={**log.channels, "voltage.arm": np.full(len(log), np.nan)})
     assert engine.step_inputs(empty, make_grid(empty, ARM, ZERO, 0.005)) == {}
+
+
+@pytest.mark.parametrize("law", [False, True])
+def test_an_euler_step_a_period_is_a_held_torque_with_euler_steps(law: bool) -> None:
+    """MuJoCo's own servo, read once a step, is one whose torque is held for the step."""
+    scales = dict.fromkeys(LEG_JOINTS, SCALE)
+    effect = StribeckFriction.at(("knee",), scales) if law else CoulombFriction.at(("knee",), scales)
+    rows = np.array([[0.05, 0.0, 0.4], [0.2, 0.0, 0.4]])[:, : len(effect.parameters)]
+    own = Replay(leg(), LEG_LOG, (effect,), Numerics("Euler", 0.002), effort=True).predict(rows)
+    held = Replay(leg(), LEG_LOG, (effect,), Numerics("Euler", 0.002, 0.002), effort=True).predict(rows)
+    np.testing.assert_allclose(held.position, own.position, atol=1e-12)
+    assert own.effort is not None
+    assert held.effort is not None
+    np.testing.assert_allclose(held.effort[:, :-1], own.effort[:, :-1], atol=1e-9)
+
+
+def test_a_held_torque_does_not_depend_on_the_step_of_the_plant() -> None:
+    def position(step: float) -> np.ndarray[Any, Any]:
+        return Replay(leg(), LEG_LOG, (), Numerics("RK4", step, 0.004)).predict(np.zeros((1, 0))).position
+
+    assert np.abs(position(0.002) - position(0.001)).max() < 1e-6
+    longer = Replay(leg(), LEG_LOG, (), Numerics("RK4", 0.002, 0.002)).predict(np.zeros((1, 0))).position
+    assert np.abs(position(0.002) - longer).max() > 1e-5

@@ -19,6 +19,7 @@ from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRec
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
 from sysid_btr.diagnosis.scan import Question, Trace, questions, scan
 from sysid_btr.diagnosis.signature import proposals, signature
+from sysid_btr.diagnosis.split import later_split
 from sysid_btr.diagnosis.words import message_of, sentence_of
 from sysid_btr.effects.base import Effect
 from sysid_btr.effects.library import select_effects
@@ -27,7 +28,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift
 from sysid_btr.identify.intervals import Estimate, estimates
-from sysid_btr.identify.refit import Fitted, inflate, judge, paired_t, refit, robust_refit, shorten
+from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, paired_t, refit, robust_refit, shorten
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.study import Study
 from sysid_btr.models.modifier import Modifier
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 SCAN_SECONDS = 15.0
 """Part of each log that is scanned; the leading hypotheses are refitted on more."""
 REFIT_SECONDS = 20.0
+LADDER_SECONDS = 6.0
+"""Part of each log on which it is decided where a refit begins."""
 MAX_ROUNDS = 6
 MAX_REFINEMENTS = 1
 """Times the step may be halved in the end."""
@@ -52,10 +55,14 @@ SETTLED = 0.8
 """Once a hypothesis explains all there is, others are tried only if they promise this fraction of its gain."""
 MOST_THINNED, SMALL = 10, 0.5
 """Groups up to this size are thinned; an amount below this fraction of the largest is doubted."""
+IDLE = 1e-3
+"""Amount, relative to the largest, of a place where there is nothing."""
 HOPELESS = 0.5
 """After three trials, hypotheses that promise less than this fraction of the best are not tried."""
-ENOUGH = 0.004
+ENOUGH = 0.006
 """Fraction of a column's excess that may be left: effects have shapes, not only amounts."""
+TRACE = 0.002
+"""Fraction of a column's first excess that is not worth an effect."""
 STEP_GAIN = 0.03
 """An effect must remove this fraction of the held-out chi2, and of the excess at its joints."""
 STEP_T = 3.0
@@ -91,6 +98,7 @@ def close(
     rng: Generator | None = None,
     journal: Journal | None = None,
     progress: Progress = silent,
+    start: FloatArray | None = None,
 ) -> Closing:
     """Name the effects that a model lacks.
 
@@ -101,6 +109,7 @@ def close(
     effects : names of the effects to consider, or ``all``.
     rng : for estimators that draw; not used by the default ones.
     journal, progress : see `sysid_btr.estimators`.
+    start : (p,) where the declared parameters begin; default the nominal values.
 
     Returns
     -------
@@ -109,7 +118,7 @@ def close(
     """
     began = perf_counter()
     library = usable_effects(select_effects(effects), study)
-    first = fit(study, parameters, rng=rng, journal=journal, progress=progress)
+    first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
     study = first.study
     declared = first.modifiers
     before = judge(study, declared, first.values, first.replays)
@@ -129,8 +138,8 @@ def close(
         hypotheses = form_hypotheses(traces, len(residual), REFITS)
         trials: list[tuple[Hypothesis, Fitted]] = []
         for hypothesis in hypotheses:
-            if any(_at_floor(f) and hypothesis.gain < SETTLED * h.gain for h, f in trials):
-                continue  # another one explains all there is, and this one promises much less
+            if any(_settled(hypothesis, h, f) for h, f in trials):
+                continue
             if len(trials) >= 3 and hypothesis.gain < HOPELESS * hypotheses[0].gain:
                 break
             trials.append((hypothesis, _try(study, state, hypothesis)))
@@ -143,7 +152,7 @@ def close(
             replays += trials[-1][1].evaluations
         if not candidates or state.effects:
             candidates += _candidates(state.fitted, trials)
-        winner = _choose(state.fitted, trials)
+        winner = _choose(state.fitted, [t for t in trials if _worth(before, state.fitted, t[1])])
         if winner is None:
             break
         hypothesis, fitted = winner
@@ -162,6 +171,8 @@ def close(
             fitted = _without(study, state, fitted, staying, hypothesis, declared)
             keep = [i for i, e in enumerate(state.effects) if e in staying]
             state = _State(state.fitted, staying, tuple(state.rivals[i] for i in keep))
+        if study.free:
+            study = study.settled(fitted.modifiers, fitted.values)
         study, fitted = robust_refit(study, fitted, 1)
         replays += fitted.evaluations
         state = _State(fitted, (*state.effects, hypothesis.modifier(study.scales)), (*state.rivals, rivals))
@@ -182,7 +193,12 @@ def close(
         final_estimates, study, state = _estimates(study, state)
     count = sum(len(m.parameters) for m in declared)
     verdict = _verdict(before, state)
-    named = _named(study, state, before, final_estimates[count:], declared) if state.effects else ()
+    later = later_split(study, state.fitted, _column_limit(state.fitted)) if verdict == "unexplained" else None
+    if later is not None:
+        # what is missing shows only after the fitted part: fit more of the log, hold out what is left
+        again = replace(later, numerics=first.study.numerics, inflation={})
+        return close(again, parameters, effects=effects, rng=rng, progress=progress, start=start)
+    named = _named(study, state, before, final_estimates[count:], declared, candidates) if state.effects else ()
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
     if verdict == "unexplained":
@@ -235,13 +251,10 @@ def _without(
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
     """Effects that these logs could show at all, given mount and channels."""
     free = any(log.meta.mount == "free" for log in study.train)
-    effort = "effort" in study.channels and any(log.joints("effort") for log in study.train)
     result = []
     for effect in effects:
         if effect.name.startswith("foot_") and not free:
             continue
-        if effect.name == "sensor_delay" and not effort:
-            continue  # the same as a command delay where nothing else is measured
         result.append(effect)
     return tuple(result)
 
@@ -251,7 +264,7 @@ def _scan(
 ) -> tuple[list[Trace], FloatArray]:
     short = shorten(study, SCAN_SECONDS)
     problem = short.train_problem(state.fitted.modifiers, state.fitted.values)
-    residual, jacobian = linearise(problem, state.fitted.values)
+    residual, jacobian = linearise(problem, state.fitted.values, step=study.stencil)
     places = {
         "joint": joint_names(study.robot),
         "servo": servo_joints(study.robot),
@@ -275,23 +288,31 @@ def _try(
     study: Study, state: _State, hypothesis: Hypothesis, values: FloatArray | None = None
 ) -> Fitted:
     modifiers = (*state.fitted.modifiers, hypothesis.modifier(study.scales))
-    start = np.concatenate([state.fitted.values if values is None else values, hypothesis.start])
+    rest = state.fitted.values if values is None else values
+    ladder = hypothesis.ladder()
+    starts = np.column_stack([np.tile(rest, (len(ladder), 1)), ladder])
+    start = best_start(shorten(study, LADDER_SECONDS), modifiers, starts)
     found = refit(shorten(study, REFIT_SECONDS), modifiers, start)
-    return judge(study, modifiers, found.values, found.evaluations)
+    return judge(study, modifiers, found.values, found.evaluations + len(starts))
 
 
 def _at_floor(fitted: Fitted) -> bool:
     """Whether neither the whole nor any single column has anything left to explain."""
     return fitted.holdout <= FLOOR_ALL + CHANCE * fitted.overall_chance and bool(
-        np.all(fitted.columns <= FLOOR_COLUMN + CHANCE * fitted.chance)
+        np.all(fitted.columns <= _column_limit(fitted))
     )
+
+
+def _column_limit(fitted: Fitted) -> FloatArray:
+    """Chi2 of each column up to which it shows nothing more."""
+    return FLOOR_COLUMN + CHANCE * fitted.chance
 
 
 def _good_enough(before: Fitted, now: Fitted) -> bool:
     """Whether every column is at the floor, or has lost all but a trace of what it had above it."""
     if len(before.columns) != len(now.columns):
         return False
-    limit = np.maximum(FLOOR_COLUMN + CHANCE * now.chance, 1 + ENOUGH * (before.columns - 1))
+    limit = np.maximum(_column_limit(now), 1 + ENOUGH * (before.columns - 1))
     return bool(np.all(now.columns <= limit))
 
 
@@ -301,12 +322,14 @@ def _thin(
     """Drop places of a group whose small amounts held-out data do not miss."""
     spent = 0
     kinds = len(hypothesis.effect.kinds)
-    neutral = np.array([k.nominal for k in hypothesis.effect.kinds])
+    main = hypothesis.effect.main
+    neutral = hypothesis.modifier(study.scales).neutral[main]
+    once = hypothesis.effect.passing
     waiting = True
     while waiting and not hypothesis.shared and 1 < len(hypothesis.places) <= MOST_THINNED:
         waiting = False
         amounts = fitted.values[-hypothesis.size :].reshape(-1, kinds)
-        size = np.linalg.norm((amounts - neutral) / [max(abs(k.scale), 1e-12) for k in hypothesis.effect.kinds], axis=1)
+        size = np.abs(amounts[:, main] - neutral)
         least = int(np.argmin(size))
         if size[least] > SMALL * size.max():
             break
@@ -318,9 +341,16 @@ def _thin(
         )
         trial = _try(study, state, smaller, fitted.values[: -hypothesis.size])
         spent += trial.evaluations
-        if trial.misfit <= fitted.misfit + SIMPLER:
+        loss = trial.misfit_everywhere - fitted.misfit_everywhere if once else trial.misfit - fitted.misfit
+        if size[least] <= IDLE * size.max() or loss <= SIMPLER:
             hypothesis, fitted, waiting = smaller, trial, True
     return hypothesis, fitted, spent
+
+
+def _settled(hypothesis: Hypothesis, other: Hypothesis, fitted: Fitted) -> bool:
+    """Whether another one explains all there is and this one, which is no simpler, promises much less."""
+    enough = SETTLED if hypothesis.size >= other.size else HOPELESS
+    return _at_floor(fitted) and hypothesis.gain < enough * other.gain
 
 
 def _gain(before: Fitted, after: Fitted) -> float:
@@ -337,24 +367,43 @@ def _choose(
     passing = [(h, f) for h, f in trials if h.effect.passing and _accepted_once(before, f)]
     if passing:
         event = min(passing, key=lambda t: t[1].misfit_everywhere)
-        others = [f.misfit_everywhere for h, f in sound if not h.effect.passing]
-        if event[1].misfit_everywhere < min(others, default=np.inf) - SIMPLER:
+        lasting = [f.misfit_everywhere for h, f in sound if not h.effect.passing]
+        if event[1].misfit_everywhere < min(lasting, default=np.inf) - SIMPLER:
             return event
     if not sound:
         return None
     best = min(f.misfit for _, f in sound)
     near = [(h, f) for h, f in sound if f.misfit <= best + SIMPLER]
-    return min(near, key=lambda t: (t[0].size, t[1].misfit))
+    named = {h.effect.name for h, _ in near}
+    near = [(h, f) for h, f in near if not named & set(h.effect.yields_to)]
+    simplest = min(near, key=lambda t: (t[0].size, t[1].misfit))
+    # what is no refinement of the simplest one may still beat it beyond chance
+    others = [(h, f) for h, f in near if _another(h, simplest[0]) and f.misfit < simplest[1].misfit]
+    beyond = [(h, f) for h, f in others if paired_t(f, simplest[1]) > STEP_T]
+    return min(beyond or [simplest], key=lambda t: (t[0].size, t[1].misfit))
+
+
+def _another(hypothesis: Hypothesis, simple: Hypothesis) -> bool:
+    """Whether a hypothesis is of another kind than a simple one, and no generalisation of it."""
+    return hypothesis.effect.name != simple.effect.name and simple.effect.name not in hypothesis.effect.includes
+
+
+def _worth(first: Fitted, before: Fitted, after: Fitted) -> bool:
+    """Whether an effect removes more than a trace of what some column had above its floor at first.
+
+    Where effects of a real robot have been found, their shapes are a little wrong, and much else would help.
+    """
+    if len(first.columns) != len(before.columns):
+        return True
+    excess = np.maximum(first.columns - 1, TRACE)
+    return bool(np.nanmax((before.columns - after.columns) / excess) >= TRACE)
 
 
 def _accepted(before: Fitted, after: Fitted) -> bool:
     """Whether the improvement on held-out data is large and not by chance."""
     drop = (before.holdout - after.holdout) / before.holdout
     local = float(np.max((before.holdout_columns - after.holdout_columns) / before.holdout_columns))
-    t = paired_t(
-        np.concatenate([after.train_blocks, after.holdout_blocks]),
-        np.concatenate([before.train_blocks, before.holdout_blocks]),
-    )
+    t = paired_t(after, before)
     # an effect that acts in few stretches (a limit, a push) has a small t however large it is there
     certain = t > STEP_T or max(drop, local) > STEP_CERTAIN
     return (drop > STEP_GAIN or local > 5 * STEP_GAIN) and certain and after.train < before.train
@@ -372,13 +421,13 @@ def _rivals(
     """Whether another effect does nearly as well at the same joints, and held-out data cannot decide."""
     hypothesis, fitted = winner
     rival, alternative = other
-    if rival.effect.name == hypothesis.effect.name or hypothesis.effect.name in rival.effect.includes:
+    if rival.effect.name == hypothesis.effect.name:
+        return False
+    if hypothesis.effect.name in (*rival.effect.includes, *rival.effect.yields_to):
         return False
     if alternative.misfit > fitted.misfit + NEAR:
         return False
-    both_best = np.concatenate([fitted.holdout_blocks, fitted.train_blocks])
-    both_other = np.concatenate([alternative.holdout_blocks, alternative.train_blocks])
-    return paired_t(both_best, both_other) < STEP_T
+    return paired_t(fitted, alternative) < STEP_T
 
 
 def _candidates(
@@ -418,7 +467,36 @@ def _prune(
         if not _accepted(trial, state.fitted):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
             state = _State(trial, others, state.rivals[:at] + state.rivals[at + 1 :])
+    for effect in state.effects if len(state.effects) > 1 else ():
+        thinner, dropped, cost = _thin_again(study, state, effect, declared)
+        spent += cost
+        if dropped:
+            state = thinner
+            removed.append(f"{effect.name} at {', '.join(dropped)}")
     return state, tuple(removed), spent
+
+
+def _thin_again(
+    study: Study, state: _State, effect: Effect, declared: tuple[Modifier, ...]
+) -> tuple[_State, tuple[str, ...], int]:
+    """Drop places of an effect that were in demand only until a later effect was found."""
+    if effect.shared:
+        return state, (), 0
+    at = state.effects.index(effect)
+    others = state.effects[:at] + state.effects[at + 1 :]
+    first = sum(len(m.parameters) for m in (*declared, *state.effects[:at]))
+    own = slice(first, first + len(effect.parameters))
+    values = np.delete(state.fitted.values, own)
+    rest = replace(state.fitted, modifiers=(*declared, *others), values=values)
+    amounts = state.fitted.values[own]
+    whole = Hypothesis(type(effect), effect.places, False, amounts, 0.0)
+    now = replace(
+        state.fitted, modifiers=(*rest.modifiers, effect), values=np.concatenate([values, amounts])
+    )
+    left, fitted, spent = _thin(study, _State(rest, others), whole, now)
+    rivals = (*state.rivals[:at], *state.rivals[at + 1 :], state.rivals[at])
+    dropped = tuple(p for p in effect.places if p not in left.places)
+    return _State(fitted, (*others, left.modifier(study.scales)), rivals), dropped, spent
 
 
 def _merge(study: Study, state: _State, declared: tuple[Modifier, ...]) -> _State:
@@ -456,7 +534,7 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
     for refinement in range(MAX_REFINEMENTS + 1):
         fitted = state.fitted
         problem = study.train_problem(fitted.modifiers, fitted.values)
-        residual, jacobian = linearise(problem, fitted.values)
+        residual, jacobian = linearise(problem, fitted.values, step=study.stencil)
         jacobian = np.nan_to_num(jacobian)
         shift = numerics_shift(problem, fitted.values, jacobian, residual)
         found = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift)
@@ -487,6 +565,7 @@ def _named(
     before: Fitted,
     found: Sequence[Estimate],
     declared: tuple[Modifier, ...],
+    candidates: Sequence[Candidate],
 ) -> tuple[NamedEffect, ...]:
     result, column = [], 0
     offset = sum(len(m.parameters) for m in declared)
@@ -497,8 +576,7 @@ def _named(
         without[offset + column : offset + column + size] = effect.neutral
         off = judge(study, state.fitted.modifiers, without)
         gain = (off.holdout - state.fitted.holdout) / max(off.holdout, 1e-12)
-        if effect.name == "command_delay" and "effort" not in study.channels:
-            confused = (*confused, "sensor_delay")
+        confused = (*confused, *(n for n in _alike(effect, candidates) if n not in confused))
         result.append(
             NamedEffect(
                 effect=effect.name,
@@ -512,3 +590,10 @@ def _named(
         )
         column += size
     return tuple(result)
+
+
+def _alike(effect: Effect, candidates: Sequence[Candidate]) -> tuple[str, ...]:
+    """Effects that did as well at the same places but give way to this one, by convention."""
+    own = next((c for c in candidates if c.effect == effect.name and set(c.where) == set(effect.places)), None)
+    giving = {e.name for e in select_effects(("all",)) if effect.name in e.yields_to}
+    return tuple(name for name in (own.confused_with if own else ()) if name in giving)

@@ -105,3 +105,8 @@ class Closing:
     values: FloatArray
     replays: int
     seconds: float
+
+    def _repr_html_(self) -> str:
+        from sysid_btr.report.notebook import html_of_outcome
+
+        return html_of_outcome(self)

@@ -46,6 +46,12 @@ class Hypothesis:
         """Number of parameters."""
         return len(self.start)
 
+    def ladder(self) -> FloatArray:
+        """Amounts (k, parameters) that a refit may begin from, those of the scan first."""
+        kinds = len(self.effect.kinds)
+        amounts = [self.effect.ladder(a) for a in self.start.reshape(-1, kinds)]
+        return np.vstack([self.start, np.hstack(amounts)])
+
     def modifier(self, scales: Scales) -> Effect:
         return self.effect.at(self.places, scales, shared=self.shared).around(self.start)
 

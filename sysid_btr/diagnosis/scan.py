@@ -16,10 +16,12 @@ from sysid_btr.effects.base import Effect, Probe, middle_scale, scale_at
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.scales import Scales
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.replay.structure import EVERYWHERE, limbs
+from sysid_btr.replay.structure import EVERYWHERE
 
 FAINT = 1e-4
 """Squared response of a direction, relative to an effect's strongest one, below which it is not moved."""
+BLOCK = 256
+"""Questions whose responses are held at once."""
 NO_RESPONSE = 1e-6
 """Response, relative to the residual, below which a log cannot show an effect."""
 
@@ -135,7 +137,7 @@ def _limb(question: Question, where: dict[str, int]) -> int:
 
 def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Question]]:
     """Structural questions that can share one compiled model: one place a limb."""
-    where = limbs(problem.episodes[0].replay.model)
+    where = problem.where
     result: list[list[Question]] = []
     for effect in dict.fromkeys(q.effect for q in asked):
         own = [q for q in asked if q.effect is effect and len(q.places) == 1]
@@ -163,7 +165,7 @@ def _ask(
     scales: Scales,
 ) -> list[Trace]:
     """Simulate questions that share a set of modifiers."""
-    where = limbs(problem.episodes[0].replay.model)
+    where = problem.where
     extra: list[Modifier] = []
     offset: dict[tuple[type[Effect], str], int] = {}
     column = len(values)
@@ -197,9 +199,9 @@ def _ask(
     rows_of = {limb: np.flatnonzero(limb_of_row == limb) for limb in lanes}
     everywhere = np.arange(len(rest))
     base = wide.residuals(candidates[:1])[0]
-    for first in range(1, len(candidates), 64):
-        block = wide.residuals(candidates[first : first + 64]) - base
-        for change, job in zip(block, jobs[first - 1 : first + 63], strict=False):
+    for first in range(1, len(candidates), BLOCK):
+        block = wide.residuals(candidates[first : first + BLOCK]) - base
+        for change, job in zip(block, jobs[first - 1 : first - 1 + BLOCK], strict=False):
             for i, d in job:
                 rows = rows_of.get(_limb(asked[i], where), everywhere)
                 finite = np.isfinite(change).all()

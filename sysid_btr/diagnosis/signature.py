@@ -233,7 +233,8 @@ def signature(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -
     """
     torques = missing_torques(study.train_problem(modifiers), values, study.scales)
     if not torques:
-        return {"summary": "not characterised: the replay fails or is too short", "joints": []}
+        why = "its base was free, and windows are too short" if study.free else "the replay fails or is too short"
+        return {"summary": f"not characterised: {why}", "joints": []}
     loud = sorted((t for t in torques if t.chi2 >= LOUD), key=lambda t: -_blame(t))
     if not loud:
         return {"summary": "no torque at any joint: positions are at their noise floor", "joints": []}

@@ -15,6 +15,9 @@ from sysid_btr.models.scales import JointScale, Scales
 if TYPE_CHECKING:
     from sysid_btr.models.fields import Scope
 
+LADDER = (0.3, 0.55, 1.0, 1.8, 3.0, 5.0)
+"""Multiples of the scan's amount at which a refit may begin."""
+
 Probe = tuple[tuple[float, ...], ...]
 """Values (one tuple a direction) whose responses span an effect linearly at one working point."""
 
@@ -38,6 +41,7 @@ class Effect(Modifier):
     everywhere : whether it may well be alike at all places, so that the scan asks for that too.
     passing : whether it happens at some moment, so that held-out data may hold nothing of it.
     includes : simpler effects that are special cases of this one.
+    yields_to : effects that are named instead of this one where a log cannot tell them apart.
     held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
     """
 
@@ -54,6 +58,7 @@ class Effect(Modifier):
     everywhere: ClassVar[bool] = False
     passing: ClassVar[bool] = False
     includes: ClassVar[tuple[str, ...]] = ()
+    yields_to: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
@@ -108,6 +113,21 @@ class Effect(Modifier):
         """The effect with bounds narrowed to where a search from these values makes sense."""
         return self
 
+    @classmethod
+    def ladder(cls, values: FloatArray) -> FloatArray:
+        """Amounts (k, kinds) that a refit may begin from, given what a linear scan says (kinds,).
+
+        The response of friction, play, limits and delays bends: the scan's amount can be far off.
+        """
+        if cls.signed:
+            return values[None]
+        nominal = np.array([k.nominal for k in cls.kinds])
+        result = np.tile(values, (len(LADDER), 1))
+        fixed = cls.kinds[cls.main].name in cls.held
+        anchor = 0.0 if fixed else nominal[cls.main]
+        result[:, cls.main] = anchor + np.array(LADDER) * (values[cls.main] - anchor)
+        return result
+
     @property
     def neutral(self) -> FloatArray:
         """(parameters,) values at which the model is exactly the plain one."""
@@ -126,6 +146,8 @@ def scale_at(scales: Scales, place: str) -> JointScale:
         velocity_peak=max(s.velocity_peak for s in whole),
         acceleration_rms=max(s.acceleration_rms for s in whole),
         span=max(s.span for s in whole),
+        measured_rms=max(s.measured_rms for s in whole),
+        measured_peak=max(s.measured_peak for s in whole),
     )
 
 
@@ -139,4 +161,6 @@ def middle_scale(scales: Sequence[JointScale]) -> JointScale:
         acceleration_rms=float(np.median([s.acceleration_rms for s in scales])),
         span=float(np.median([s.span for s in scales])),
         slide=scales[0].slide,
+        measured_rms=float(np.median([s.measured_rms for s in scales])),
+        measured_peak=float(np.median([s.measured_peak for s in scales])),
     )

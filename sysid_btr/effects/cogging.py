@@ -12,6 +12,9 @@ from sysid_btr.effects.base import Effect, Probe
 from sysid_btr.models.modifier import Kind, Step
 from sysid_btr.models.scales import JointScale
 
+PHASES, SIZES, SHIFTS = 8, (1.0, 1.7), (-0.04, -0.02, 0.0, 0.02, 0.04)
+"""From which a refit may begin, relative to what a linear scan says."""
+
 
 @dataclass(frozen=True)
 class Cogging(Effect):
@@ -34,7 +37,7 @@ class Cogging(Effect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        peak, size = max(scale.torque_peak, 1e-9), 0.1 * scale.torque_rms
+        peak, size = 2 * scale.counter_peak, 0.1 * scale.torque_rms
         turn = 2 * np.pi / max(scale.span, 1e-9)
         return (
             Kind("sine", scale.unit("Nm"), 0.0, -peak, peak, size),
@@ -51,6 +54,21 @@ class Cogging(Effect):
         """A probe at a spatial frequency that the residual proposes."""
         size = 0.1 * scale.torque_rms
         return ((size, 0.0, number), (0.0, size, number))
+
+    @classmethod
+    def ladder(cls, values: FloatArray) -> FloatArray:
+        """Nearby numbers of teeth in all phases: a period off over the range of motion is a minimum of its own."""
+        sine, cosine, number = values
+        size, phase = np.hypot(sine, cosine), np.arctan2(cosine, sine)
+        turns = phase + 2 * np.pi * np.arange(PHASES) / PHASES
+        return np.array(
+            [
+                (size * larger * np.cos(turn), size * larger * np.sin(turn), number * (1 + shift))
+                for larger in SIZES
+                for shift in SHIFTS
+                for turn in turns
+            ]
+        )
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         phase = values[:, :, 2] * step.qpos[:, index]

@@ -28,7 +28,7 @@ class ConstantForce(Effect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        peak = max(scale.torque_peak, 1e-9)
+        peak = scale.counter_peak
         return (Kind("torque", scale.unit("Nm"), 0.0, -peak, peak, 0.1 * scale.torque_rms),)
 
     def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray:

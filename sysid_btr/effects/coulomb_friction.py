@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.effects.base import Effect
+from sysid_btr.effects.base import Effect, Probe
 from sysid_btr.models.modifier import Kind, Rig
 from sysid_btr.models.scales import JointScale
 
@@ -18,7 +18,6 @@ class CoulombFriction(Effect):
     name: ClassVar[str] = "coulomb_friction"
     title: ClassVar[str] = "dry friction"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.05),)
-    steps: ClassVar[tuple[float, ...]] = (1.0, 4.0)
     everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("stribeck_friction", "slow motion below the Stribeck velocity"),
@@ -28,9 +27,14 @@ class CoulombFriction(Effect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        return (
-            Kind("torque", scale.unit("Nm"), 0.0, 0.0, max(scale.torque_peak, 1e-9), 0.15 * scale.torque_rms),
-        )
+        unit, size = scale.unit("Nm"), 0.15 * scale.torque_rms
+        return (Kind("torque", unit, 0.0, 0.0, scale.counter_peak, size),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        size = cls.sized(scale)[0].scale
+        held = 0.7 * scale.measured_rms  # a joint that sticks most of the time
+        return tuple(((t,),) for t in (size, 4 * size, *((held,) if held > 6 * size else ())))
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         rig.array("dof_frictionloss")[:, rig.index.dof[rig.index.of(self.places)]] += values[:, :, 0]

@@ -21,7 +21,8 @@ class SensorDelay(Effect):
     name: ClassVar[str] = "sensor_delay"
     title: ClassVar[str] = "delay of the sensor"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.15, 0.004),)
-    needs: ClassVar[str] = "position and a sensor that is not delayed (effort)"
+    needs: ClassVar[str] = "position, and a sensor or a coupled joint that is not delayed"
+    yields_to: ClassVar[tuple[str, ...]] = ("command_delay",)
     everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("command_delay", "a second sensor that is not delayed (current, effort, IMU)"),

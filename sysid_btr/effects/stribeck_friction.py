@@ -16,6 +16,9 @@ from sysid_btr.effects.base import Effect, Probe
 from sysid_btr.models.modifier import Kind, Step
 from sysid_btr.models.scales import JointScale
 
+SIZES, SHARES, SPEEDS = (0.6, 1.0, 1.6), (0.2, 0.5, 0.8), (0.4, 1.0, 2.5)
+"""Multiples of what a linear scan says from which a refit may begin."""
+
 
 @dataclass(frozen=True)
 class StribeckFriction(Effect):
@@ -38,7 +41,7 @@ class StribeckFriction(Effect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        peak, size = max(scale.torque_peak, 1e-9), 0.15 * scale.torque_rms
+        peak, size = scale.counter_peak, 0.15 * scale.torque_rms
         speed = 0.2 * scale.velocity_rms
         return (
             Kind("coulomb", scale.unit("Nm"), 0.0, 0.0, peak, size),
@@ -48,13 +51,26 @@ class StribeckFriction(Effect):
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
-        coulomb, static, speed = cls.sized(scale)
+        size, _, speed = cls.sized(scale)
+        held = 0.5 * scale.measured_rms  # a joint that sticks most of the time
+        amounts = (2 * size.scale, *((held,) if held > 6 * size.scale else ()))
         return tuple(
-            (
-                (2 * coulomb.scale, 0.0, factor * speed.nominal),
-                (0.0, 2 * static.scale, factor * speed.nominal),
-            )
+            ((a, 0.0, factor * speed.nominal), (0.0, a, factor * speed.nominal))
+            for a in amounts
             for factor in (0.3, 1.0, 3.0)
+        )
+
+    @classmethod
+    def ladder(cls, values: FloatArray) -> FloatArray:
+        """Sum of both, share of the part that falls, and velocity: stick-slip has many local minima."""
+        total = float(values[0] + values[1])
+        return np.array(
+            [
+                (total * size * (1 - share), total * size * share, values[2] * speed)
+                for size in SIZES
+                for share in SHARES
+                for speed in SPEEDS
+            ]
         )
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:

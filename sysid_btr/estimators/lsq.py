@@ -242,6 +242,9 @@ class LeastSquares:
         Random candidates simulated for each random start wanted; the best are taken.
     confirm
         Whether central differences confirm the minimum; without, a result carries no Jacobian.
+    least_gain
+        Decrease of the loss, in mean squared residuals, that is worth a step: 0.01 is a tenth of a standard
+        deviation. More where the objective is rough.
 
     Notes
     -----
@@ -261,6 +264,7 @@ class LeastSquares:
     starts: tuple[tuple[float, ...], ...] = ()
     prescreen: int = 8
     confirm: bool = True
+    least_gain: float = _STD_FRACTION
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or self.n_starts < 1 or self.prescreen < 1:
@@ -355,13 +359,14 @@ class LeastSquares:
                 )
             full = model.step(0.0, -u, 1.0 - u, scheme.rank_tolerance)
             promised = model.predicted(full)
-            tolerance = min(self.tolerance, _STD_FRACTION / model.residuals)
+            tolerance = min(self.tolerance, self.least_gain / model.residuals)
             short = bool(np.max(np.abs(full)) < self.step_tolerance)
             if short or promised <= tolerance * loss:
                 blind = model.failed.any()
                 return _Point(u, loss, steps, Termination.STALLED if blind else Termination.CONVERGED, model)
             found = _climb(evaluator, model, u, loss, scheme.rank_tolerance, ladder, note)
-            rough = promised <= max(tolerance, _ROUGH_FRACTION / model.residuals) * loss
+            rough = promised <= max(_ROUGH_FRACTION, 4 * self.least_gain) / model.residuals * loss
+            rough |= promised <= tolerance * loss
             halted = Termination.CONVERGED if rough and not model.failed.any() else Termination.STALLED
             if found is None and model.neighbour[1] < (1.0 - tolerance) * loss:
                 found = (*model.neighbour, _FIRST_DAMPING)  # what the differences stumbled on

@@ -12,18 +12,22 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, silent
+from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.intervals import Estimate, estimates
-from sysid_btr.identify.refit import inflate, refit, robust_refit
+from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
+from sysid_btr.replay.numerics import held_numerics
 
 if TYPE_CHECKING:
     from numpy.random import Generator
+
+    from sysid_btr.identify.profile import Profile
 
 SHIFT_TOLERATED = 0.3
 """Shift of an estimate under half the step, in standard errors, beyond which the step is halved."""
@@ -31,6 +35,10 @@ MAX_REFINEMENTS = 3
 MISFIT = 1.5
 """Chi2 of a column beyond which its error, not its noise, sets its weight."""
 ROBUST_ROUNDS = 4
+SERVO_SECONDS = 6.0
+"""Part of each log on which the realisation of a digital servo is chosen ..."""
+SERVO_MARGIN = 0.05
+"""... and mean decrease of log chi2 for which the one that takes longer is."""
 FAR = 3.0
 """Mean squared whitened residual beyond which a model is too wrong for its step to matter."""
 
@@ -50,6 +58,7 @@ class Fit:
     numerics_shift : (p,) change of the estimates when the step is halved.
     replays : candidates simulated.
     seconds : wall time.
+    profiles : likelihood along single parameters, where it was asked for (`identify.profile`).
     """
 
     study: Study
@@ -62,6 +71,12 @@ class Fit:
     numerics_shift: FloatArray
     replays: int
     seconds: float
+    profiles: tuple[Profile, ...] = ()
+
+    def _repr_html_(self) -> str:
+        from sysid_btr.report.notebook import html_of_outcome
+
+        return html_of_outcome(self)
 
 
 def fit(
@@ -102,26 +117,44 @@ def fit(
     began = perf_counter()
     modifiers = as_modifiers(study, parameters)
     estimator = LeastSquares() if estimator is None else estimator
+    if study.free and isinstance(estimator, LeastSquares):
+        estimator = walking(estimator)
     rng = np.random.default_rng(0) if rng is None else rng
     journal = Journal() if journal is None else journal
+    if any(m.parameters for m in modifiers):
+        study = realise_servo(study, modifiers, start)
     problem = study.train_problem(modifiers, start)
     if not problem.parameters:
         raise UsageError("nothing to fit: free at least one parameter, for example --fit 'mass:*'")
-    rough = 0
+    rough, budget = 0, budget or Budget()
+    if isinstance(estimator, Chain) and isinstance(estimator.stages[-1], LeastSquares) and distance is None:
+        # the others find the valley; least squares then do from there what they always do
+        explored, estimator, budget = estimator.explore(
+            problem, rng=rng, budget=budget, journal=journal, progress=progress
+        )
+        if isinstance(estimator, LeastSquares):
+            rough, estimator = explored.evaluations, walking(estimator) if study.free else estimator
+        journal = journal.section()
+        problem = study.train_problem(modifiers, explored.x)
     if isinstance(estimator, LeastSquares):
         # first find how large each column's error is, then weigh the columns by it
-        coarse = refit(study, modifiers, problem.start)
+        if study.free:
+            study, coarse = settled_refit(study, modifiers, problem.start)
+        else:
+            coarse = refit(study, modifiers, problem.start)
         if float(coarse.train_columns.max()) > MISFIT:
-            study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
+            if not study.free:  # windows are weighed one by one already
+                study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
             study = inflate(study, coarse, memory=True)
-        rough = coarse.evaluations
+        rough += coarse.evaluations
         problem = study.train_problem(modifiers, coarse.values)
     if distance is not None and isinstance(estimator, LeastSquares):
         raise UsageError("lsq minimises squared residuals: for another distance choose ga, cmaes or nlopt:ALGORITHM")
     goal = problem if distance is None else DistanceProblem(problem, distance)
-    result = estimator.fit(goal, rng=rng, budget=budget or Budget(), journal=journal, progress=progress)
+    result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
     replays = result.evaluations + rough
-    values, jacobian, residual = _at_optimum(problem, result)
+    step = study.stencil
+    values, jacobian, residual = _at_optimum(problem, result, step)
     for _ in range(MAX_REFINEMENTS):
         shift = numerics_shift(problem, values, jacobian, residual)
         found = estimates(problem.parameters, values, jacobian, residual, problem.blocks)
@@ -129,7 +162,8 @@ def fit(
         worst = np.max(np.abs(shift) / np.maximum(std, 1e-300), initial=0.0)
         misfit = before_chi2(problem, residual)
         digital = study.numerics.integrator == "Euler"
-        if not isinstance(estimator, LeastSquares) or worst <= SHIFT_TOLERATED or digital or misfit > FAR:
+        # impacts leave a little chaos under any step: it widens the intervals instead
+        if study.free or not isinstance(estimator, LeastSquares) or worst <= SHIFT_TOLERATED or digital or misfit > FAR:
             break
         study = replace(study, numerics=study.numerics.halved())
         problem = study.train_problem(modifiers, values)
@@ -137,7 +171,9 @@ def fit(
             problem, rng=rng, budget=Budget(), journal=Journal(), progress=progress
         )
         replays += polished.evaluations
-        values, jacobian, residual = _at_optimum(problem, polished)
+        values, jacobian, residual = _at_optimum(problem, polished, step)
+    if study.free:
+        shift = np.hypot(shift, placement_shift(study, modifiers, values))
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift)
     extra = 0
     if isinstance(estimator, LeastSquares):
@@ -154,6 +190,50 @@ def fit(
         replays=replays + extra,
         seconds=perf_counter() - began,
     )
+
+
+def realise_servo(study: Study, modifiers: tuple[Modifier, ...], start: FloatArray | None) -> Study:
+    """The study with the realisation of a digital servo that fits the log better.
+
+    Held torque under a known velocity, or an Euler step a period, which is a velocity from differences.
+    """
+    if study.numerics.integrator != "Euler":
+        return study
+    held = held_numerics(study.robot, study.train[0], study.threads)
+    if held is None:
+        return study
+    short = shorten(study, SERVO_SECONDS)
+    first = nominal_start(modifiers) if start is None else start
+    misfit = [
+        float(np.mean(np.log(refit(replace(short, numerics=n), modifiers, first, iterations=4).train_columns)))
+        for n in (held, study.numerics)
+    ]
+    return replace(study, numerics=held) if misfit[0] < misfit[1] - SERVO_MARGIN else study
+
+
+def settled_refit(study: Study, modifiers: tuple[Modifier, ...], start: FloatArray) -> tuple[Study, Fitted]:
+    """First fit of walks: parameters, and starts of windows, in turn, with a cheap integrator."""
+    numerics = study.numerics
+    study = replace(study, numerics=study.rough)
+    first = best_start(study, modifiers, contact_starts(modifiers, start))
+    coarse = refit(study, modifiers, first, iterations=5)
+    study = study.settled(modifiers, coarse.values, held=False)
+    again = refit(study, modifiers, coarse.values, iterations=3)
+    study = replace(study.settled(modifiers, again.values), numerics=numerics)
+    return study, judge(study, modifiers, again.values, again.evaluations + coarse.evaluations)
+
+
+def contact_starts(modifiers: tuple[Modifier, ...], start: FloatArray) -> FloatArray:
+    """Starts (k, p) that differ in how stiff the ground is: between a soft and a hard one the loss is not convex."""
+    own = [i for i, p in enumerate(p for m in modifiers for p in m.parameters) if p.name.startswith("foot_compliance")]
+    starts = np.tile(start, (1 + len(STIFFER) * bool(own), 1))
+    for row, factor in zip(starts[1:], STIFFER, strict=False):
+        row[own] *= factor
+    return starts
+
+
+STIFFER = (0.6, 0.35, 0.25)
+"""Contact time constants tried first, as factors of the nominal."""
 
 
 def as_modifiers(study: Study, parameters: Sequence[str] | Sequence[Modifier]) -> tuple[Modifier, ...]:
@@ -184,10 +264,27 @@ def numerics_shift(
     return -np.asarray(np.linalg.lstsq(jacobian, fine - residual, rcond=1e-6)[0])
 
 
-def _at_optimum(problem: ReplayProblem, result: FitResult) -> tuple[FloatArray, FloatArray, FloatArray]:
+def placement_shift(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray) -> FloatArray:
+    """Change of the estimates, (p,), to first order, when the windows of walks begin elsewhere.
+
+    In the right model this is a part of the noise; in another it is the least that the model's error does.
+    """
+    relaid = study.relaid().settled(modifiers, values, held=False)
+    problem = relaid.train_problem(modifiers, values)
+    residual, jacobian = linearise(problem, values, step=study.stencil)
+    if not np.isfinite(jacobian).all():
+        return np.full(len(values), np.inf)
+    span = problem.upper - problem.lower
+    change = -np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0])
+    return np.clip(change, -span, span)
+
+
+def _at_optimum(
+    problem: ReplayProblem, result: FitResult, step: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     if result.jacobian is not None and result.residual is not None:
         return result.x, result.jacobian, result.residual
-    residual, jacobian = linearise(problem, result.x)
+    residual, jacobian = linearise(problem, result.x, step=step)
     return result.x, jacobian, residual
 
 

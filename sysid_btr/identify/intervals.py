@@ -116,7 +116,7 @@ def estimates(
     for i, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
         span = parameter.upper - parameter.lower
         at_bound = bool(min(value - parameter.lower, parameter.upper - value) <= 1e-6 * span)
-        state, reason = _tell(i, parameters, std, norm, cov, span)
+        state, reason = tell(i, parameters, std, norm, cov, span)
         low = max(float(value) - quantile * float(std[i]), parameter.lower)
         high = min(float(value) + quantile * float(std[i]), parameter.upper)
         result.append(
@@ -136,7 +136,7 @@ def estimates(
     return tuple(result)
 
 
-def _tell(
+def tell(
     i: int,
     parameters: Sequence[Parameter],
     std: FloatArray,
@@ -144,6 +144,14 @@ def _tell(
     cov: FloatArray,
     span: float,
 ) -> tuple[Identifiable, str]:
+    """Whether a log tells parameter `i`, and if not, why.
+
+    Parameters
+    ----------
+    std, cov : (p,), (p, p) uncertainty of all parameters.
+    norm : (p,) norms of the residuals' derivatives.
+    span : width of the parameter's bounds.
+    """
     parameter = parameters[i]
     if std[i] <= parameter.scale:
         return "yes", ""

@@ -10,7 +10,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.study import Study
+from sysid_btr.identify.study import WIDE_STEP, Study
+from sysid_btr.identify.walk import Walk
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem
 
@@ -31,7 +32,8 @@ class Fitted:
     train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
     memory : integrated autocorrelation, in samples, of each column's fitted residual; 1 if white.
     chance, overall_chance : standard deviation of `columns` and of `holdout` at the floor, by chance alone.
-    train_blocks, holdout_blocks : sums of squares, whitened as fitted, by stretch of half a second.
+    train_cells, holdout_cells : (columns, stretches) sums of squares over noise floor by stretch of half a
+        second.
     evaluations : candidates simulated.
     """
 
@@ -45,8 +47,8 @@ class Fitted:
     memory: FloatArray
     chance: FloatArray
     overall_chance: float
-    train_blocks: FloatArray
-    holdout_blocks: FloatArray
+    train_cells: FloatArray
+    holdout_cells: FloatArray
     evaluations: int
 
     @property
@@ -77,10 +79,41 @@ def refit(
         max_iterations=30 if polish else iterations,
         tolerance=1e-6 if polish else 2e-4,
     )
+    if study.free:
+        estimator = walking(estimator)
     result = estimator.fit(
         problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
     )
     return judge(study, modifiers, result.x, evaluations=result.evaluations)
+
+
+def best_start(study: Study, modifiers: tuple[Modifier, ...], starts: FloatArray) -> FloatArray:
+    """The best (p,) of several first guesses (k, p), of which the first wins a tie."""
+    starts = np.clip(starts, *_bounds(modifiers))
+    if len(starts) == 1:
+        return np.asarray(starts[0])
+    losses = study.train_problem(modifiers, starts[0]).loss(starts)
+    return np.asarray(starts[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))])
+
+
+MOST_WALKED = 8.0
+"""s of windows on which hypotheses about a walk are compared."""
+
+
+LEAST_GAIN = 0.5
+"""Decrease of the sum of squared residuals, in their mean square, for which a walk is not simulated again."""
+
+
+def walking(estimator: LeastSquares) -> LeastSquares:
+    """Least squares for an objective that impacts roughen: differences over what matters, a coarser end."""
+    return replace(
+        estimator,
+        tolerance=max(estimator.tolerance, 1e-4),
+        forward_step=max(estimator.forward_step, WIDE_STEP),
+        central_step=max(estimator.central_step, WIDE_STEP),
+        max_iterations=min(estimator.max_iterations, 8),
+        least_gain=LEAST_GAIN,
+    )
 
 
 def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, evaluations: int = 0) -> Fitted:
@@ -104,8 +137,8 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
         memory=_memory(train, r),
         chance=np.sqrt(2 / np.maximum(a + b if same else np.concatenate([a, b]), 1)),
         overall_chance=float(np.sqrt(2 / max(b.sum(), 1))),
-        train_blocks=_by_block(train, r),
-        holdout_blocks=_by_block(holdout, s),
+        train_cells=_by_cell(train, r),
+        holdout_cells=_by_cell(holdout, s),
         evaluations=evaluations + 1,
     )
 
@@ -170,8 +203,14 @@ def _memory(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     return np.maximum(ratio, 1.0)
 
 
-def _by_block(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
-    return np.asarray(np.bincount(problem.blocks, weights=np.nan_to_num(residual, nan=1e6) ** 2))
+def _by_cell(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
+    """Sums of squares over noise floor, (columns, stretches)."""
+    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
+    columns, blocks = problem.column_labels, problem.blocks
+    width = int(blocks.max()) + 1
+    square = np.nan_to_num(residual, nan=1e6) ** 2 * factor[columns]
+    sums = np.bincount(columns * width + blocks, square, len(problem.columns) * width)
+    return np.asarray(sums.reshape(-1, width), dtype=np.float64)
 
 
 def _bounds(modifiers: tuple[Modifier, ...]) -> tuple[FloatArray, FloatArray]:
@@ -179,22 +218,35 @@ def _bounds(modifiers: tuple[Modifier, ...]) -> tuple[FloatArray, FloatArray]:
     return np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
 
 
-def paired_t(better: FloatArray, worse: FloatArray) -> float:
-    """Paired t statistic over stretches of time of the decrease from `worse` to `better`."""
-    size = min(len(better), len(worse))
-    difference = worse[:size] - better[:size]
-    difference = difference[(worse[:size] > 0) | (better[:size] > 0)]
+def paired_t(better: Fitted, worse: Fitted) -> float:
+    """Paired t statistic, over stretches of time of all data, of the decrease from `worse` to `better`.
+
+    Columns are weighed by what the better one leaves in them: one that it does not explain cannot decide.
+    """
+    pairs = (
+        (better.train_cells, worse.train_cells, better.train_columns),
+        (better.holdout_cells, worse.holdout_cells, better.holdout_columns),
+    )
+    changes = []
+    for ours, theirs, chi2 in pairs:
+        live = (theirs > 0).any(axis=0) | (ours > 0).any(axis=0)
+        changes.append((((theirs - ours) / np.maximum(chi2, 1.0)[:, None]).sum(axis=0))[live])
+    difference = np.concatenate(changes)
     if len(difference) < 3:
         return 0.0
     spread = float(np.std(difference, ddof=1))
-    if spread == 0:
-        return 0.0
-    return float(np.mean(difference) / spread * np.sqrt(len(difference)))
+    return float(np.mean(difference) / spread * np.sqrt(len(difference))) if spread > 0 else 0.0
 
 
 def shorten(study: Study, seconds: float) -> Study:
-    """The same study with at most the first so many seconds of each training log."""
+    """The same study with at most the first so many seconds of each training log.
+
+    Of walks it keeps some of their windows, and a cheaper integrator.
+    """
     train = tuple(
-        log.window(0, max(int(np.searchsorted(log.time, log.time[0] + seconds)), 2)) for log in study.train
+        log.thinned(min(seconds, MOST_WALKED))
+        if isinstance(log, Walk)
+        else log.window(0, max(int(np.searchsorted(log.time, log.time[0] + seconds)), 2))
+        for log in study.train
     )
-    return replace(study, train=train)
+    return replace(study, train=train, numerics=study.rough)

@@ -65,8 +65,7 @@ def score_problem(problem: ReplayProblem, values: FloatArray) -> dict[str, Chann
     floor: dict[str, float] = {}
     for episode in problem.episodes:
         outputs = episode.replay.predict(values[None])
-        for target in episode.targets:
-            error = target.measured - target.predicted(outputs)[0]
+        for target, error in zip(episode.targets, episode.errors(outputs), strict=True):
             for k, joint in enumerate(target.joints):
                 good = target.mask[:, k]
                 channel = target.channel

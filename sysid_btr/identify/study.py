@@ -10,6 +10,18 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError
+from sysid_btr.estimators.lsq import LeastSquares
+from sysid_btr.identify.walk import (
+    FASTEST,
+    Walk,
+    covered,
+    cut_up,
+    lay_windows,
+    make_replay,
+    make_walk,
+    settle,
+    walk_numerics,
+)
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split
 from sysid_btr.models.grammar import parse_parameters
@@ -18,10 +30,12 @@ from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.models.scales import JointScale, Scales
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, make_targets
-from sysid_btr.replay.engine import Numerics, Replay
+from sysid_btr.replay.engine import Numerics, make_index
 from sysid_btr.replay.numerics import choose_numerics
 
 TINY = 1e-9
+WIDE_STEP = 4e-3
+"""Finite-difference step, fraction of the range, that is wide against the roughness of impacts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +97,12 @@ class Study:
     ) -> Episode:
         robot = self.robot.for_log(log)
         present = tuple(c for c in channels if any(log.has(c, j) for j in joint_names(robot)))
-        replay = Replay(
-            robot, log, tuple(modifiers), self.numerics, effort="effort" in present, threads=self.threads
+        if isinstance(log, Walk):
+            log = log.only(begin)
+        replay = make_replay(
+            robot, log, modifiers, self.numerics, effort="effort" in present, threads=self.threads
         )
-        targets = make_targets(log, replay.index.joints, present, WARM_UP)
+        targets = make_targets(log, replay.index.joints, present, 0.0 if isinstance(log, Walk) else WARM_UP)
         if not targets:
             raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
         if self.inflation:
@@ -99,7 +115,55 @@ class Study:
         if begin > 0 or np.isfinite(end):
             time = log.time - log.time[0]
             targets = tuple(t.window(begin, end, time) for t in targets)
+        if isinstance(log, Walk):
+            inside = covered(log)[:, None]
+            targets = tuple(replace(t, mask=t.mask & inside) for t in targets)
+            return Episode(replay, targets, log.marginal)
         return Episode(replay, targets)
+
+    @property
+    def free(self) -> bool:
+        """Whether any log is of a free base."""
+        return any(isinstance(log, Walk) for log in (*self.train, *self.holdout))
+
+    @property
+    def rough(self) -> Numerics:
+        """A cheaper integrator for walks: good enough for first fits and for derivatives by the starts."""
+        return Numerics("implicitfast", min(self.numerics.timestep, FASTEST)) if self.free else self.numerics
+
+    def relaid(self) -> Study:
+        """The study with the windows of walks half a window later; held-out walks keep theirs."""
+        return replace(
+            self,
+            train=tuple(
+                lay_windows(log, log.seconds, late=0.5) if isinstance(log, Walk) else log for log in self.train
+            ),
+        )
+
+    @property
+    def stencil(self) -> float:
+        """Finite-difference step, fraction of a parameter's range: wide where impacts roughen the objective."""
+        return WIDE_STEP if self.free else LeastSquares.central_step
+
+    def settled(self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True) -> Study:
+        """The study with the starts of its windows moved to where the data want them under these parameters.
+
+        `held` says whether those of held-out windows too, which only judge.
+        """
+        def settled(log: Log, begin: float) -> Log:
+            if not isinstance(log, Walk):
+                return log
+            log = log.only(begin)
+            episode = self._episode(log, modifiers, self.channels, begin, np.inf)
+            return settle(log, episode.replay, episode.targets, values, self.rough)
+
+        return replace(
+            self,
+            train=tuple(settled(log, 0.0) for log in self.train),
+            holdout=tuple(settled(log, begin) for log, begin in zip(self.holdout, self.split, strict=True))
+            if held
+            else self.holdout,
+        )
 
 
 def nominal_start(modifiers: Sequence[Modifier]) -> FloatArray:
@@ -134,19 +198,24 @@ def make_study(
     UsageError
         If the held-out fraction is not between 0 and 1.
     """
-    episodes = [e for log in logs for e in split_episodes(log)]
+    episodes = [_ready(robot, e) for log in logs for e in split_episodes(log)]
     train: list[Log] = []
     held: list[Log] = []
     split: list[float] = []
     if isinstance(holdout, int | float):
         for episode in episodes:
             fitted, _ = holdout_split(episode, float(holdout))
+            cut = float(episode.time[len(fitted)] - episode.time[0])
+            if isinstance(episode, Walk):
+                episode = cut_up(robot, episode, (cut,), threads)
+                fitted = episode.window(0, len(fitted))
             train.append(fitted)
             held.append(episode)
-            split.append(float(episode.time[len(fitted)] - episode.time[0]))
+            split.append(cut)
     else:
-        train = episodes
-        held = [e for log in holdout for e in split_episodes(log)]
+        train = [cut_up(robot, e, (), threads) if isinstance(e, Walk) else e for e in episodes]
+        held = [_ready(robot, e) for log in holdout for e in split_episodes(log)]
+        held = [cut_up(robot, e, (), threads) if isinstance(e, Walk) else e for e in held]
         split = [0.0] * len(held)
     study = Study(
         robot=robot,
@@ -159,9 +228,19 @@ def make_study(
         threads=threads,
     )
     if numerics is None:
-        chosen, error = choose_numerics(robot, study.train[0], threads)
-        return replace(study, numerics=chosen, numerics_error=error)
-    return replace(study, numerics=numerics)
+        walks = [log for log in study.train if isinstance(log, Walk)]
+        if walks:
+            numerics, error = walk_numerics(robot, walks[0], threads)
+        else:
+            numerics, error = choose_numerics(robot, study.train[0], threads)
+        study = replace(study, numerics_error=error)
+    study = replace(study, numerics=numerics)
+    return study.settled((), np.zeros(0)) if study.free else study
+
+
+def _ready(robot: Robot, episode: Log) -> Log:
+    """An episode with its base reconstructed, if that was free."""
+    return make_walk(robot, episode) if episode.meta.mount == "free" else episode
 
 
 def split_episodes(log: Log) -> list[Log]:
@@ -172,18 +251,21 @@ def split_episodes(log: Log) -> list[Log]:
 def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, threads: int = 0) -> Scales:
     """Sizes at every joint, from replays of the plain model."""
     torque, velocity, acceleration, span = [], [], [], []
+    measured: dict[str, list[FloatArray]] = {}
     for log in logs:
-        replay = Replay(robot.for_log(log), log, (), numerics, effort=True, threads=threads)
+        replay = make_replay(robot.for_log(log), log, (), numerics, effort=True, threads=threads)
         outputs = replay.predict(np.zeros((1, 0)))
         joints = replay.index.joints
         assert outputs.effort is not None
         skip = np.searchsorted(outputs.time, min(WARM_UP, 0.1 * outputs.time[-1]))
         t, v, q = outputs.effort[0, skip:], outputs.velocity[0, skip:], outputs.position[0, skip:]
         time = outputs.time[skip:]
+        for joint, asked in _torque_asked(robot.for_log(log), log).items():
+            measured.setdefault(joint, []).append(asked)
         torque.append(t)
         velocity.append(v)
         acceleration.append(np.gradient(v, time, axis=0))
-        span.append(np.ptp(q, axis=0))
+        span.append(np.nanmax(q, axis=0) - np.nanmin(q, axis=0))
     model = robot.compile()
     t, v, a = (np.concatenate(x) for x in (torque, velocity, acceleration))
     reach = np.max(span, axis=0)
@@ -193,6 +275,7 @@ def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, thread
 
     scales = {}
     for i, joint in enumerate(joints):
+        asked = np.concatenate(measured.get(joint, [np.zeros(0)]))
         scales[joint] = JointScale(
             torque_rms=max(float(rms(t)[i]), TINY),
             torque_peak=max(float(np.nanmax(np.abs(t[:, i]))), TINY),
@@ -201,5 +284,25 @@ def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, thread
             acceleration_rms=max(float(rms(a)[i]), TINY),
             span=max(float(reach[i]), TINY),
             slide=int(model.joint(joint).type[0]) == 2,
+            measured_rms=float(rms(asked)) if len(asked) else 0.0,
+            measured_peak=float(np.max(np.abs(asked), initial=0.0)),
         )
     return scales
+
+
+def _torque_asked(robot: Robot, log: Log) -> dict[str, FloatArray]:
+    """Torque (n,) of each joint's servo for the commands and positions as logged."""
+    model = robot.compile()
+    index = make_index(model)
+    result = {}
+    for joint, a in zip(index.joints, index.actuator, strict=True):
+        if a < 0 or not (log.has("position", joint) and log.has("command", joint)):
+            continue
+        command, position = log.channels[f"command.{joint}"], log.channels[f"position.{joint}"]
+        gear = float(model.actuator_gear[a, 0])
+        bias = model.actuator_biasprm[a]
+        force = model.actuator_gainprm[a, 0] * command + bias[0] + bias[1] * gear * position
+        if model.actuator_forcelimited[a]:
+            force = np.clip(force, *model.actuator_forcerange[a])
+        result[joint] = (gear * force)[np.isfinite(force)]
+    return result

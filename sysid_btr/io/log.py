@@ -130,6 +130,11 @@ class Log:
     def __len__(self) -> int:
         return len(self.time)
 
+    def _repr_html_(self) -> str:
+        from sysid_btr.report.notebook import html_of_log
+
+        return html_of_log(self)
+
     def joints(self, channel: str) -> tuple[str, ...]:
         """Names that have a column in `channel`, in column order."""
         prefix = f"{channel}."

@@ -276,6 +276,24 @@ class FootFriction(FieldModifier):
 
 
 @dataclass(frozen=True)
+class FootCompliance(FieldModifier):
+    """Time constant of the contact between a body's geoms and the ground, as a factor of the nominal."""
+
+    name: ClassVar[str] = "foot_compliance"
+    scope: ClassVar[Scope] = "body"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 10.0, 0.1),)
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        solref = rig.array("geom_solref")
+        geoms, constant = rig.model.geom_bodyid, rig.model.geom_solref[:, 0]
+        for place, body in enumerate(_bodies(rig, self.places)):
+            solref[:, (geoms == body) & (constant > 0), 0] *= values[:, place, :1]
+        # MuJoCo takes the mean of two geoms' time constants
+        ground = (rig.model.body_weldid[geoms] == 0) & (constant > 0)
+        solref[:, ground, 0] *= values[:, :, 0].mean(axis=1)[:, None]
+
+
+@dataclass(frozen=True)
 class StartPosition(FieldModifier):
     """Correction of the position at which the replay starts."""
 
@@ -314,6 +332,7 @@ FIELDS: dict[str, type[FieldModifier]] = {
         ConstantForce,
         Delay,
         FootFriction,
+        FootCompliance,
         StartPosition,
         StartVelocity,
     )

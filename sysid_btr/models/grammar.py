@@ -64,14 +64,15 @@ def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[Fie
     field, colon, rest = expression.partition(":")
     if not colon or not rest:
         raise UsageError("expected FIELD:GLOB[,GLOB...][=shared], for example mass:*KneePitch or kp:*=shared")
-    if field not in FIELDS:
-        close = difflib.get_close_matches(field, FIELDS, n=1)
+    fields = {**FIELDS, **robot.fields}
+    if field not in fields:
+        close = difflib.get_close_matches(field, fields, n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise UsageError(f"unknown field {field!r}{hint}; fields are {', '.join(FIELDS)}")
+        raise UsageError(f"unknown field {field!r}{hint}; fields are {', '.join(fields)}")
     globs, equals, option = rest.partition("=")
     if equals and option != "shared":
         raise UsageError(f"after '=' only 'shared' is allowed, not {option!r}")
-    cls = FIELDS[field]
+    cls = fields[field]
     known = SCOPES[cls.scope](robot)
     names: list[str] = []
     for glob in globs.split(","):
@@ -174,10 +175,10 @@ def _own_bounds(
 SIZES: dict[str, Callable[[JointScale], tuple[float, float]]] = {
     "damping": lambda s: (0.1 * s.damping, 5 * s.damping),
     "quadratic_damping": lambda s: (0.1 * s.damping / s.velocity_rms, 5 * s.damping / s.velocity_rms),
-    "frictionloss": lambda s: (0.1 * s.torque_rms, s.torque_peak),
+    "frictionloss": lambda s: (0.1 * s.torque_rms, s.counter_peak),
     "armature": lambda s: (0.1 * s.inertia, 5 * s.inertia),
     "stiffness": lambda s: (0.1 * s.torque_rms / s.span, 10 * s.torque_rms / s.span),
     "force_limit": lambda s: (0.1 * s.torque_peak, 2 * s.torque_peak),
-    "constant_force": lambda s: (0.1 * s.torque_rms, s.torque_peak),
+    "constant_force": lambda s: (0.1 * s.torque_rms, s.counter_peak),
 }
 """Field -> (size that matters, largest sensible value) at a joint."""

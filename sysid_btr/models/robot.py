@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import mujoco
 
     from sysid_btr.io.log import Log
+    from sysid_btr.models.fields import FieldModifier
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,10 @@ class Robot:
     path : the file it came from, if any.
     digest : SHA-256 of the compiled-from XML.
     bounds : parameter or ``FIELD`` -> (lower, upper), over the defaults of the grammar.
+    priors : parameter, glob or ``FIELD`` -> prior as text, such as ``normal(1, 0.1)``, for posteriors.
     tied : groups of joints driven by one motor; their gains are one parameter.
     always : modifiers without parameters of their own that belong to the robot (drive electronics).
+    fields : ``FIELD`` -> modifier of the parameters that this robot has beyond those of the grammar.
     """
 
     name: str
@@ -40,6 +43,13 @@ class Robot:
     tied: tuple[tuple[str, ...], ...] = ()
     always: tuple[Modifier, ...] = ()
     configure: Callable[[Robot, Log], Robot] | None = None
+    priors: Mapping[str, str] = field(default_factory=dict)
+    fields: Mapping[str, type[FieldModifier]] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        from sysid_btr.report.notebook import html_of_robot
+
+        return html_of_robot(self)
 
     def for_log(self, log: Log) -> Robot:
         """The robot as this log's metadata describes it (servo registers, supply, load)."""

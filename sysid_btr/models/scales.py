@@ -16,6 +16,8 @@ class JointScale:
     velocity_rms, velocity_peak, acceleration_rms : of the motion in the plain model.
     span : of the motion.
     slide : whether the joint is a slide.
+    measured_rms, measured_peak : torque that the servo's law gives for the command and the measured position;
+        far more than `torque_rms` where something holds the joint back. 0 where no position is logged.
     """
 
     torque_rms: float
@@ -25,11 +27,18 @@ class JointScale:
     acceleration_rms: float
     span: float
     slide: bool = False
+    measured_rms: float = 0.0
+    measured_peak: float = 0.0
 
     @property
     def damping(self) -> float:
         """Viscous coefficient whose torque is the servo's rms torque."""
         return self.torque_rms / self.velocity_rms
+
+    @property
+    def counter_peak(self) -> float:
+        """Largest torque that the servo can have worked against."""
+        return max(self.torque_peak, self.measured_peak, 1e-9)
 
     @property
     def inertia(self) -> float:

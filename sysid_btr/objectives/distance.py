@@ -1,4 +1,4 @@
-"""Distances between a log and a replay that need not be sums of squares: MSE, phi1, phi2.
+"""Distances between a log and a replay that need not be sums of squares: MSE, phi1, phi2, Wasserstein.
 
 phi1 and phi2 are those of Zagal, Delpiano, Ruiz-del-Solar, Self-modeling in humanoid soccer robots, Robotics
 and Autonomous Systems 57 (2009), equations 4 to 6, doi:10.1016/j.robot.2009.03.010; the information distance
@@ -7,6 +7,7 @@ d(X, Y) = H(X|Y) + H(Y|X) is Crutchfield's (1990).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -79,6 +80,71 @@ class Phi2:
                     else np.inf
                 )
         return total
+
+
+@dataclass(frozen=True)
+class Wasserstein:
+    """1-Wasserstein distance between the distributions of measured and predicted values, one joint at a time.
+
+    Summed over joints, SI units: ``integral |F(x) - G(x)| dx`` of the two empirical distribution functions, as
+    `scipy.stats.wasserstein_distance` has it; for equally many samples the mean of ``|sort(a) - sort(b)|``.
+
+    Notes
+    -----
+    It ignores time altogether: any reordering of the samples, and with it delay, phase and speed, goes
+    unnoticed, and so does what joints do together. It sees where and how far a joint moves and how long it
+    stays there: offsets, gains, limits, the share of time at rest. The sensor's noise widens the measured
+    distribution; below the noise floor a difference means nothing.
+    """
+
+    def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
+        total = np.zeros(len(predicted))
+        for k in range(target.mask.shape[1]):
+            good = target.mask[:, k]
+            if not good.any():
+                continue
+            measured = np.sort(target.measured[good, k])
+            # NaN sorts to the end and stays: a failed candidate is not near anything
+            total += np.mean(np.abs(np.sort(predicted[:, good, k], axis=1) - measured), axis=1)
+        return total
+
+
+Fitness = Callable[[FloatArray], FloatArray]
+"""Fitness (m,) of one joint's motion (m, samples) in m runs."""
+
+
+def amplitude(motion: FloatArray) -> FloatArray:
+    """Standard deviation over time, (m,), of motions (m, samples): how far a joint swings."""
+    return np.asarray(np.std(motion, axis=1))
+
+
+@dataclass(frozen=True)
+class Phi1:
+    """phi1 over the episodes of a log: each is the run of one controller, judged by the fitness of its motion.
+
+    The sum over episodes and channels of ``|fitness(log) - fitness(replay)|``, fitness being the mean over
+    joints; divided by the number of episodes it is `phi1`.
+
+    Attributes
+    ----------
+    fitness : of one joint's motion. A log of joints knows no task, so the default is how far they swing; give
+        your own for a task.
+
+    Notes
+    -----
+    One number an episode: it cannot tell more parameters than there are episodes.
+    """
+
+    fitness: Fitness = amplitude
+
+    def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
+        real, simulated = 0.0, np.zeros(len(predicted))
+        joints = target.mask.shape[1]
+        for k in range(joints):
+            good = target.mask[:, k]
+            real += float(self.fitness(target.measured[None, good, k])[0]) / joints
+            simulated += self.fitness(predicted[:, good, k]) / joints
+        return phi1(np.array([real]), simulated[:, None])
 
 
 def phi1(real: FloatArray, simulated: FloatArray) -> FloatArray:
@@ -161,7 +227,7 @@ class DistanceProblem:
 
 
 def get_distance(name: str) -> Distance | None:
-    """A distance by name: ``likelihood`` (None), ``mse``, ``phi2`` or ``phi2:BINS``.
+    """A distance by name: ``likelihood`` (None), ``mse``, ``phi1``, ``phi2``, ``phi2:BINS`` or ``wasserstein``.
 
     Raises
     ------
@@ -171,8 +237,13 @@ def get_distance(name: str) -> Distance | None:
     base, _, bins = name.partition(":")
     if name == "likelihood":
         return None
-    if name == "mse":
-        return MeanSquare()
+    if name in _PLAIN:
+        return _PLAIN[name]()
     if base == "phi2" and (not bins or bins.isdigit()):
         return Phi2(int(bins)) if bins else Phi2()
-    raise UsageError(f"unknown distance {name!r}; there are likelihood, mse, phi2 and phi2:BINS (such as phi2:20)")
+    raise UsageError(
+        f"unknown distance {name!r}; there are likelihood, {', '.join(_PLAIN)}, phi2 and phi2:BINS (such as phi2:20)"
+    )
+
+
+_PLAIN: Mapping[str, Callable[[], Distance]] = {"mse": MeanSquare, "phi1": Phi1, "wasserstein": Wasserstein}

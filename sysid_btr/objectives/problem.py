@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.models.modifier import Modifier, Parameter
+from sysid_btr.models.modifier import Modifier, Outputs, Parameter
+from sysid_btr.objectives.marginal import Marginal, Projection, projections
 from sysid_btr.objectives.targets import Target
 from sysid_btr.replay.engine import Numerics, Replay
 from sysid_btr.replay.structure import colour, limbs, parameter_limbs
@@ -17,10 +18,50 @@ from sysid_btr.replay.structure import colour, limbs, parameter_limbs
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One episode: its replay and what it is compared with."""
+    """One episode: its replay and what it is compared with.
+
+    Attributes
+    ----------
+    replay, targets : what is simulated, and the channels it is compared with.
+    marginal : where the replay starts from states that are known within an uncertainty, what that can do.
+    """
 
     replay: Replay
     targets: tuple[Target, ...]
+    marginal: Marginal | None = None
+
+    @cached_property
+    def projections(self) -> tuple[Projection, ...]:
+        """Whitening of every window whose start is uncertain."""
+        return () if self.marginal is None else projections(self.marginal, self.targets)
+
+    def raw(self, outputs: Outputs) -> FloatArray:
+        """Residuals over sigma, (m, r), target by target, sample by sample; starts are taken as they are."""
+        parts = [((t.measured - t.predicted(outputs)) / t.sigma)[:, t.mask] for t in self.targets]
+        return np.concatenate(parts, axis=1)
+
+    def whitened(self, outputs: Outputs) -> FloatArray:
+        """Whitened residuals, (m, r), in the same order."""
+        white = self.raw(outputs)
+        for projection in self.projections:
+            white[:, projection.columns] = projection.whiten(white[:, projection.columns])
+        return white
+
+    def errors(self, outputs: Outputs) -> list[FloatArray]:
+        """Errors in SI units of the first candidate, (n, k) for each target; NaN where a sample does not count.
+
+        An uncertain start is integrated out, so that they have the size of the noise where the model is right.
+        """
+        white, result, first = self.whitened(outputs)[0], [], 0
+        for projection in self.projections:
+            white[projection.columns] /= projection.weight  # every window counts in full
+        for target in self.targets:
+            error = np.full(target.mask.shape, np.nan)
+            last = first + int(target.mask.sum())
+            error[target.mask] = white[first:last]
+            result.append(error * target.sigma)
+            first = last
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +118,7 @@ class ReplayProblem:
         for episode in self.episodes:
             width = int(sum(t.mask.sum() for t in episode.targets))
             for rows, outputs in episode.replay.chunks(candidates):
-                place = column
-                for target in episode.targets:
-                    white = (target.measured - target.predicted(outputs)) / target.sigma
-                    size = int(target.mask.sum())
-                    result[rows, place : place + size] = white[:, target.mask]
-                    place += size
+                result[rows, column : column + width] = episode.whitened(outputs)
             column += width
         return result
 
@@ -92,9 +128,7 @@ class ReplayProblem:
         total = np.zeros(len(candidates))
         for episode in self.episodes:
             for rows, outputs in episode.replay.chunks(candidates):
-                for target in episode.targets:
-                    white = (target.measured - target.predicted(outputs)) / target.sigma
-                    total[rows] += np.sum(white[:, target.mask] ** 2, axis=1)
+                total[rows] += np.sum(episode.whitened(outputs) ** 2, axis=1)
         return total
 
     @cached_property
@@ -132,10 +166,15 @@ class ReplayProblem:
         )
 
     @cached_property
+    def where(self) -> dict[str, int]:
+        """Limb of every joint and body by name; one limb where a free base joins them in any of the logs."""
+        free = (e.replay for e in self.episodes if e.replay.log.meta.mount == "free")
+        return limbs(next(free, self.episodes[0].replay).model)
+
+    @cached_property
     def _limbs(self) -> tuple[list[frozenset[int]], IntArray]:
         """Limbs each parameter acts on, and the limb of each residual."""
-        model = self.episodes[0].replay.model
-        where = limbs(model)
+        where = self.where
         of_column = np.array([where[target.joints[k]] for _, target, k in self.columns])
         return parameter_limbs(self.modifiers, where), of_column[self.column_labels]
 

@@ -89,6 +89,8 @@ def make_targets(
         measured = log.array(channel, names)
         floor = tuple(noise_floor(measured[:, k]) for k in range(len(names)))
         mask = np.isfinite(measured) & (time >= min(warm_up, 0.1 * time[-1]))[:, None]
+        if channel == "effort":
+            mask[-1] = False  # the replay ends here: what the servo is told at this sample is not replayed
         live = mask.any(axis=0)
         targets.append(
             Target(

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log
 
 CHUNK = 32
-"""Candidates simulated together; enough to share the cost of a Python step, few enough for the cache."""
+"""Candidates simulated together, at least; enough to share the cost of a Python step, few enough for the cache."""
+CHUNK_DOFS = 704
+"""Degrees of freedom simulated together, at least: small models share a step among more candidates."""
 SEGMENT = 1024
 """Steps per rollout call; bounds the records that are held at once."""
 LIFT = 1.0
@@ -38,16 +40,27 @@ LIFT = 1.0
 
 @dataclass(frozen=True)
 class Numerics:
-    """How the equations are integrated: MuJoCo's integrator by name, and the step in s."""
+    """How the equations are integrated: MuJoCo's integrator by name, and the step in s.
+
+    With `servo_period` (s, a multiple of the step) the servos compute their torque once a period and hold it;
+    without, they act as MuJoCo's own do, at every evaluation of the dynamics.
+    """
 
     integrator: str
     timestep: float
+    servo_period: float | None = None
 
     def halved(self) -> Numerics:
-        return Numerics(self.integrator, self.timestep / 2)
+        return Numerics(self.integrator, self.timestep / 2, self.servo_period)
+
+    @property
+    def held_steps(self) -> int:
+        """Steps for which a servo's torque is held; 0 where it is not."""
+        return max(round(self.servo_period / self.timestep), 1) if self.servo_period else 0
 
     def __str__(self) -> str:
-        return f"{self.integrator} {1e3 * self.timestep:g} ms"
+        held = f", servo torque held for {1e3 * self.servo_period:g} ms" if self.servo_period else ""
+        return f"{self.integrator} {1e3 * self.timestep:g} ms{held}"
 
 
 @dataclass(frozen=True)
@@ -126,8 +139,9 @@ class Replay:
             raise ValueError(
                 f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}"
             )
-        for first in range(0, len(candidates), CHUNK):
-            rows = slice(first, min(first + CHUNK, len(candidates)))
+        size = max(CHUNK, CHUNK_DOFS // max(self.model.nv, 1))
+        for first in range(0, len(candidates), size):
+            rows = slice(first, min(first + size, len(candidates)))
             with quiet():
                 outputs = self._run(candidates[rows])
             yield rows, outputs
@@ -165,41 +179,56 @@ class Replay:
                 applied = torque if applied is None else applied + torque
         batch.bind("qpos")[:, index.qpos] = qpos
         batch.bind("qvel")[:, index.dof] = qvel
+        return self._go(rig, pairs, command, applied, self.grid)
+
+    def _go(
+        self,
+        rig: Rig,
+        pairs: list[tuple[Modifier, FloatArray]],
+        command: FloatArray,
+        applied: FloatArray | None,
+        grid: Grid,
+    ) -> Outputs:
+        """Simulate from the state that the batch is in, and read the sensors."""
         laws = [(mod, val) for mod, val in pairs if type(mod).overrides("law")]
-        run = partial(self._step_through, laws=laws) if laws else self._roll_out
-        states = run(rig, command=command, applied=applied)
-        position, velocity = at_samples(self.grid, states.position, states.velocity)
+        run = self._roll_out if self.numerics.servo_period is None else self._hold_through
+        if laws:
+            run = partial(self._step_through, laws=laws)
+        states = run(rig, command=command, applied=applied, grid=grid)
+        position, velocity = at_samples(grid, states.position, states.velocity)
         effort = None
         if self.effort:
-            motor, motor_velocity = at_samples(self.grid, states.motor, states.motor_velocity)
+            motor, motor_velocity = at_samples(grid, states.motor, states.motor_velocity)
             effort = states.effort
             if effort is None:
-                steps = np.minimum(self.grid.state[self.grid.before], self.grid.steps - 1)
+                steps = np.minimum(grid.state[grid.before], grid.steps - 1)
                 effort = servo_torque(rig, command[:, steps], motor, motor_velocity)
             else:
-                effort = effort[:, self.grid.before]
-        outputs = Outputs(self.grid.sample_time, position, velocity, effort)
+                effort = effort[:, grid.before]
+        base = None if states.base is None else states.base[:, grid.before]
+        outputs = Outputs(grid.sample_time, position, velocity, effort, base)
         for modifier, values in pairs:
             modifier.read_out(rig, values, outputs)
+        batch = rig.batch
         bad = ~np.isfinite(outputs.position).all(axis=(1, 2)) | (batch.warning[:, :, 1].sum(axis=1) > 0)
-        for array in (outputs.position, outputs.velocity, outputs.effort):
+        for array in (outputs.position, outputs.velocity, outputs.effort, outputs.base):
             if array is not None:
                 array[bad] = np.nan
         return outputs
 
-    def _roll_out(self, rig: Rig, command: FloatArray, applied: FloatArray | None) -> _States:
+    def _roll_out(self, rig: Rig, command: FloatArray, applied: FloatArray | None, grid: Grid) -> _States:
         import mujoco
 
-        batch, index, keep = rig.batch, self.index, self.grid.state
+        batch, index, keep = rig.batch, self.index, grid.state
         states = _States.empty(rig.size, len(keep), index)
-        states.store(batch, index, 0, self.grid)
+        states.store(batch, index, 0, grid)
         spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
         nu, nv = self.model.nu, self.model.nv
         if applied is not None:
             spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED.value)
         driven = index.actuator >= 0
-        for first in range(0, self.grid.steps, SEGMENT):
-            last = min(first + SEGMENT, self.grid.steps)
+        for first in range(0, grid.steps, SEGMENT):
+            last = min(first + SEGMENT, grid.steps)
             control = np.zeros((rig.size, last - first, nu + (0 if applied is None else nv)))
             control[:, :, index.actuator[driven]] = command[:, first:last, driven]
             if applied is not None:
@@ -210,15 +239,53 @@ class Replay:
             states.put(index, wanted, records["qpos"][:, local], records["qvel"][:, local])
         return states
 
+    def _hold_through(
+        self, rig: Rig, command: FloatArray, applied: FloatArray | None, grid: Grid
+    ) -> _States:
+        """From one tick of digital servos to the next: their torque is computed at the tick and held."""
+        batch, index, keep = rig.batch, self.index, grid.state
+        drive = _Drive(rig)
+        d, driven = drive.driven, drive.actuators
+        qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+        qfrc = batch.bind("qfrc_applied")
+        low, high = np.sort(np.stack([drive.base_low, drive.base_high]) / drive.gear, axis=0)
+        asked = drive.base_gain[None, :, :, 0] * np.moveaxis(command[:, :, d], 1, 0) + drive.base_bias[..., 0]
+        stiffness = drive.base_bias[..., 1] * drive.gear
+        damping = drive.base_bias[..., 2] * drive.gear
+        at, speed = index.qpos[d], index.dof[d]
+        records_q = np.empty((rig.size, len(keep), self.model.nq))
+        records_v = np.empty((rig.size, len(keep), self.model.nv))
+        drive.gainprm[:, driven] = 0.0
+        drive.gainprm[:, driven, 0] = 1.0
+        drive.biasprm[:, driven] = 0.0
+        drive.forcelimited[:, driven] = False
+        slot, period = 0, self.numerics.held_steps
+        for k in range(grid.steps):
+            if slot < len(keep) and keep[slot] == k:
+                records_q[:, slot], records_v[:, slot] = qpos, qvel
+                slot += 1
+            if k % period == 0:
+                force = asked[k] + stiffness * qpos[:, at] + damping * qvel[:, speed]
+                ctrl[:, driven] = np.minimum(np.maximum(force, low), high)
+            if applied is not None:
+                qfrc[:, index.dof] = applied[:, k]
+            batch.step()
+        records_q[:, -1], records_v[:, -1] = qpos, qvel
+        drive.restore()
+        states = _States.empty(rig.size, len(keep), index)
+        states.put(index, np.arange(len(keep)), records_q, records_v)
+        return states
+
     def _step_through(
         self,
         rig: Rig,
         laws: list[tuple[Modifier, FloatArray]],
         command: FloatArray,
         applied: FloatArray | None,
+        grid: Grid,
     ) -> _States:
         """Step by step, for laws that MuJoCo cannot hold; all candidates of the chunk at once."""
-        batch, index, grid = rig.batch, self.index, self.grid
+        batch, index = rig.batch, self.index
         h = grid.timestep
         states = _States.empty(rig.size, len(grid.state), index, effort=self.effort)
         drive = _Drive(rig)
@@ -227,6 +294,8 @@ class Replay:
             for modifier, values in laws
         ]
         acts = frozenset(name for modifier, _ in laws for name in modifier.law_acts)
+        held_steps = self.numerics.held_steps
+        held: FloatArray | None = None
         inputs = step_inputs(self.log, grid)
         qpos_view, qvel_view, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         qfrc = batch.bind("qfrc_applied")
@@ -244,7 +313,9 @@ class Replay:
             step.inputs = {name: values[k] for name, values in inputs.items()}
             for modifier, values, state, places in memory:
                 modifier.law(step, values, state, places)
-            drive.write(step, acts)
+            if held_steps and k % held_steps == 0:
+                held = drive.torque(step, command[:, k], q, v)
+            drive.write(step, acts, held)
             if states.effort is not None and slot > 0 and grid.state[slot - 1] == k:
                 states.effort[:, slot - 1] = drive.torque(step, command[:, k], q, v)
             ctrl[:, drive.actuators] = command[:, k][:, drive.driven]
@@ -266,6 +337,7 @@ class _States:
     motor: FloatArray
     motor_velocity: FloatArray
     effort: FloatArray | None = None
+    base: FloatArray | None = None
 
     @classmethod
     def empty(cls, m: int, kept: int, index: Index, *, effort: bool = False) -> _States:
@@ -275,11 +347,16 @@ class _States:
         motor, motor_velocity = new(), new()
         # without a link side, the sensor sees the motor side
         position, velocity = (new(), new()) if (index.link_qpos >= 0).any() else (motor, motor_velocity)
-        return cls(position, velocity, motor, motor_velocity, new() if effort else None)
+        base = np.empty((m, kept, 13)) if index.base is not None else None
+        return cls(position, velocity, motor, motor_velocity, new() if effort else None, base)
 
     def put(self, index: Index, slots: IntArray, qpos: FloatArray, qvel: FloatArray) -> None:
         self.motor[:, slots] = qpos[:, :, index.qpos]
         self.motor_velocity[:, slots] = qvel[:, :, index.dof]
+        if self.base is not None and index.base is not None:
+            place, motion = index.base
+            self.base[:, slots, :7] = qpos[:, :, place : place + 7]
+            self.base[:, slots, 7:] = qvel[:, :, motion : motion + 6]
         linked = np.flatnonzero(index.link_qpos >= 0)
         if len(linked):
             self.position[:, slots] = self.motor[:, slots]
@@ -308,7 +385,8 @@ class _Drive:
         self.base_gain = self.gainprm[:, self.actuators].copy()
         self.base_bias = self.biasprm[:, self.actuators].copy()
         self.base_friction = self.frictionloss[:, index.dof].copy()
-        limited = self.forcelimited[:, self.actuators].astype(bool)
+        self.base_limited = self.forcelimited[:, self.actuators].copy()
+        limited = self.base_limited.astype(bool)
         base = np.sort(self.gear[..., None] * self.forcerange[:, self.actuators], axis=-1)
         self.base_low = np.where(limited, base[..., 0], -np.inf)
         self.base_high = np.where(limited, base[..., 1], np.inf)
@@ -352,9 +430,23 @@ class _Drive:
         total = step.gain * self._servo(command, qpos, qvel) + step.motor_torque
         return np.clip(total, step.limit_low, step.limit_high)
 
-    def write(self, step: Step, acts: frozenset[str]) -> None:
-        """Write what the laws changed; `acts` names what they may have."""
+    def restore(self) -> None:
+        """Give the servos back what `write` or a held torque took."""
+        self.gainprm[:, self.actuators] = self.base_gain
+        self.biasprm[:, self.actuators] = self.base_bias
+        self.forcelimited[:, self.actuators] = self.base_limited
+
+    def write(self, step: Step, acts: frozenset[str], held: FloatArray | None = None) -> None:
+        """Write what the laws changed; `acts` names what they may have, `held` is a servo's held torque."""
         d = self.driven
+        if held is not None:
+            self.gainprm[:, self.actuators] = 0.0
+            self.biasprm[:, self.actuators] = 0.0
+            self.biasprm[:, self.actuators, 0] = held[:, d] / self.gear
+            self.forcelimited[:, self.actuators] = False
+            if "friction" in acts:
+                self.frictionloss[:, self.rig.index.dof] = np.maximum(self.base_friction + step.friction, 0.0)
+            return
         if "servo" in acts:
             gain = step.gain[:, d, None]
             self.gainprm[:, self.actuators] = self.base_gain * gain
@@ -418,6 +510,9 @@ def compile_model(
                 # a robot that is held hangs clear of the ground it would otherwise stand on
                 joint.parent.pos = np.add(joint.parent.pos, (0.0, 0.0, LIFT))
                 spec.delete(joint)
+    else:
+        # the pyramid that MuJoCo has for a cone by default slides easier along one direction than another
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     # friction as stiff as the step allows: the default creeps and blurs reversals
     constant = max(2 * numerics.timestep, 0.002)
     for joint in spec.joints:

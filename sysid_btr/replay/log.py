@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def replay_log(
     robot: Robot,
     log: Log,
-    parameters: Mapping[str, float] | None = None,
+    parameters: Mapping[str, float] | tuple[tuple[Modifier, ...], FloatArray] | None = None,
     *,
     numerics: Numerics | None = None,
     threads: int = 0,
@@ -34,7 +34,8 @@ def replay_log(
     ----------
     robot : the model.
     log : commands, times and initial state; each episode starts anew.
-    parameters : expression of the grammar -> value, for example ``{"mass:*Knee*": 1.1, "kp:*": 0.9}``.
+    parameters : expression of the grammar -> value, for example ``{"mass:*Knee*": 1.1, "kp:*": 0.9}``; or
+        modifiers with their values.
     numerics : integrator and step; None chooses by a convergence check on the log.
     threads : worker threads, 0 for all cores.
 
@@ -51,7 +52,9 @@ def replay_log(
     """
     from sysid_btr.identify.study import split_episodes
 
-    modifiers, values = set_parameters(robot, parameters or {})
+    modifiers, values = (
+        parameters if isinstance(parameters, tuple) else set_parameters(robot, parameters or {})
+    )
     episodes = split_episodes(log)
     chosen = choose_numerics(robot.for_log(log), episodes[0], threads)[0] if numerics is None else numerics
     parts: dict[str, list[FloatArray]] = {}

@@ -31,18 +31,19 @@ CHECK_SECONDS = 12.0
 def choose_numerics(robot: Robot, log: Log, threads: int = 0) -> tuple[Numerics, float]:
     """Integrator and step for a log, and the change in noise floors when the step is halved.
 
-    A log that states its servo's period is replayed by explicit Euler at that period, because there the
-    control law itself is sampled and held. Otherwise fourth-order Runge-Kutta, at the largest step that
-    divides the sample period and passes the check.
+    A log that states its servo's period is replayed by one explicit Euler step a period, which is how a servo
+    behaves that reads its velocity from differences of position; `held_numerics` is the alternative.
+    Otherwise fourth-order Runge-Kutta, at the largest step that divides the sample period and passes the
+    check.
 
     Raises
     ------
     ModelError
         If the plain model diverges at every step.
     """
+    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
     if log.meta.servo_period:
         return Numerics("Euler", float(log.meta.servo_period)), float("nan")
-    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
     sample = float(np.median(np.diff(log.time)))
     step = _divisor(sample, COARSEST)
     now = _positions(robot, part, Numerics("RK4", step), threads)
@@ -58,6 +59,27 @@ def choose_numerics(robot: Robot, log: Log, threads: int = 0) -> tuple[Numerics,
                 "for its inertia, or a body without mass, is the usual cause."
             )
         step, now = step / 2, half
+
+
+def held_numerics(robot: Robot, log: Log, threads: int = 0) -> Numerics | None:
+    """Runge-Kutta steps under a servo torque that is held for the log's servo period.
+
+    Exact for a servo that knows its velocity. None where the log states no period, or where an explicit
+    Euler step a period, which is cheaper, does the same.
+    """
+    if not log.meta.servo_period:
+        return None
+    period = float(log.meta.servo_period)
+    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
+    held = Numerics("RK4", period, period)
+    now = _positions(robot, part, held, threads)
+    if _change(part, _positions(robot, part, Numerics("Euler", period), threads), now) <= TOLERATED:
+        return None
+    while True:
+        half = _positions(robot, part, held.halved(), threads)
+        if _change(part, now, half) <= TOLERATED or held.timestep / 2 < FINEST:
+            return held
+        held, now = held.halved(), half
 
 
 def _divisor(sample: float, most: float) -> float:

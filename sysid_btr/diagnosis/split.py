@@ -1,0 +1,73 @@
+"""Moving the end of the fitted part, where an effect shows only in what was to be held out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.identify.refit import Fitted
+from sysid_btr.identify.study import Study
+from sysid_btr.objectives.problem import BLOCK
+
+LEFT = 0.1
+"""Fraction of a log that stays held out, at least."""
+BRIEF = 3
+"""Stretches of half a second that hold nearly all of what happens once, and cannot be shared out."""
+MOSTLY = 0.5
+"""Fraction of the held-out excess that must show only there."""
+NEARLY = 0.9
+"""Fraction of an excess that counts as nearly all."""
+
+
+def later_split(study: Study, fitted: Fitted, limit: FloatArray) -> Study | None:
+    """The study with half of the held-out excess moved to the fitted part; None where that is no help.
+
+    Parameters
+    ----------
+    study : as laid out.
+    fitted : a model that explains the fitted part, but not the held-out one.
+    limit : (columns,) chi2 up to which a column shows nothing.
+
+    Returns
+    -------
+    Study or None
+        None if every column that is above its limit when held out is so when fitted, or if the logs held
+        out are others than those fitted.
+    """
+    if study.free or len(fitted.train_columns) != len(fitted.holdout_columns) or not any(study.split):
+        return None
+    hidden = (fitted.train_columns <= limit) & (fitted.holdout_columns > limit)
+    above = np.maximum(fitted.holdout_columns - 1, 0.0)
+    if above[hidden].sum() < MOSTLY * above.sum() or not hidden.any():
+        return None
+    problem = study.holdout_problem(fitted.modifiers)
+    residual = problem.residuals(fitted.values[None])[0]
+    scale = np.array([t.sigma[k] / t.noise[k] for _, t, k in problem.columns])[problem.column_labels]
+    excess = np.where(hidden[problem.column_labels], (residual * scale) ** 2 - 1, 0.0)
+    by_block = np.bincount(problem.blocks, np.nan_to_num(excess))
+    train, split, first = list(study.train), list(study.split), 0
+    for i, log in enumerate(study.holdout):
+        time = log.time - log.time[0]
+        count = int(time[-1] / BLOCK) + 1
+        cut = _cut(np.maximum(by_block[first : first + count], 0.0), split[i], float(time[-1]))
+        first += count
+        if cut > split[i]:
+            size = int(np.searchsorted(time, cut))
+            train[i], split[i] = log.window(0, size), float(time[size])
+    if split == list(study.split):
+        return None
+    return replace(study, train=tuple(train), split=tuple(split))
+
+
+def _cut(excess: FloatArray, now: float, end: float) -> float:
+    """Time (s) that halves the excess, or that follows all of it where it is brief."""
+    total = float(excess.sum())
+    latest = end - LEFT * end
+    if total == 0 or now >= latest:
+        return now
+    share = np.cumsum(excess) / total
+    begin, half, nearly = (int(np.searchsorted(share, s)) for s in (1 - NEARLY, 0.5, NEARLY))
+    last = nearly if nearly - begin < BRIEF else half
+    return min((last + 1) * BLOCK, latest)

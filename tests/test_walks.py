@@ -1,0 +1,379 @@
+"""Replay by windows, uncertain starts, and identification on walks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from walks import Truth, plain_walk, record_walk
+
+from sysid_btr.effects.base import Effect
+from sysid_btr.effects.command_delay import CommandDelay
+from sysid_btr.effects.constant_force import ConstantForce
+from sysid_btr.effects.foot_compliance import FootCompliance
+from sysid_btr.effects.foot_friction import FootFriction
+from sysid_btr.effects.gravity_tilt import GravityTilt
+from sysid_btr.errors import LogError
+from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify import walk as walk_module
+from sysid_btr.identify.fit import fit
+from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.study import Study, make_study
+from sysid_btr.identify.walk import Walk, covered, cut_up, lay_windows, make_walk, start_lanes
+from sysid_btr.io.log import Log
+from sysid_btr.io.parquet import read_log
+from sysid_btr.models.gait import Gait
+from sysid_btr.models.grammar import parse_parameters
+from sysid_btr.models.robot import load_robot
+from sysid_btr.objectives.marginal import Marginal, projections
+from sysid_btr.objectives.noise import NoiseFloor
+from sysid_btr.objectives.targets import Target
+from sysid_btr.replay.engine import Numerics
+from sysid_btr.replay.log import replay_log
+from sysid_btr.replay.windows import BASE, WindowReplay, Windows, on_slope
+
+FINE = Numerics("implicitfast", 0.001)
+LENGTH = 10
+
+
+def true_windows(
+    log: Log, truth: Truth, replay_joints: tuple[str, ...], first: int = 60, length: int = LENGTH
+) -> Windows:
+    """Windows that start from the true states."""
+    rows = np.array([(a, a + length) for a in range(first, len(log) - length, length)])
+    order = [truth.joints.index(j) for j in replay_joints]
+    quaternion = np.empty((len(rows), 4))
+    for k, a in enumerate(rows[:, 0]):
+        mujoco.mju_mat2Quat(quaternion[k], truth.rotation[a].ravel())
+    a = rows[:, 0]
+    return Windows(
+        rows,
+        truth.position[a],
+        quaternion,
+        truth.velocity[a],
+        truth.rate[a],
+        truth.joint_position[a][:, order],
+        truth.joint_velocity[a][:, order],
+        np.full((len(rows), BASE + 2 * len(order)), 1e-3),
+    )
+
+
+def window_replay(log: Log, truth: Truth, *modifiers: object, **kwargs: object) -> WindowReplay:
+    robot = load_robot("nao")
+    bare = WindowReplay(robot, log, tuple(modifiers), FINE, threads=1)  # type: ignore[arg-type]
+    return replace(bare, windows=true_windows(log, truth, bare.index.joints, **kwargs))  # type: ignore[arg-type]
+
+
+def joint_truth(truth: Truth, replay: WindowReplay) -> np.ndarray:
+    return truth.joint_position[:, [truth.joints.index(j) for j in replay.index.joints]]
+
+
+@cache
+def quiet_walk() -> tuple[Log, Truth]:
+    return record_walk(Gait(), 4.0, noise=0.0)
+
+
+# --- windows --------------------------------------------------------------------------------------------
+
+
+def test_windows_from_true_states_reproduce_the_whole_walk() -> None:
+    log, truth = quiet_walk()
+    replay = window_replay(log, truth)
+    outputs = replay.predict(np.zeros((1, 0)))
+    assert outputs.position.shape == (1, len(log), 22)
+    inside = np.zeros(len(log), dtype=bool)
+    for a, b in replay.windows.rows:  # type: ignore[union-attr]
+        inside[a:b] = True
+    assert np.isnan(outputs.position[0, ~inside]).all()
+    error = outputs.position[0, inside] - joint_truth(truth, replay)[inside]
+    assert np.abs(error).max() < 1e-6
+
+
+def test_a_window_does_not_depend_on_the_others_nor_on_the_candidates_beside_it() -> None:
+    log, truth = quiet_walk()
+    modifiers = parse_parameters(["mass:RKneePitch"], load_robot("nao"))
+    replay = window_replay(log, truth, *modifiers)
+    whole = replay.predict(np.array([[0.8], [1.0], [1.3]])).position
+    assert replay.windows is not None
+    alone = replace(replay, windows=replay.windows.chosen(np.array([3])))
+    a, b = replay.windows.rows[3]
+    assert np.array_equal(alone.predict(np.array([[1.3]])).position[0, a:b], whole[2, a:b])
+
+
+def test_a_delayed_command_reaches_into_the_window_from_before_it() -> None:
+    log, truth = record_walk(Gait(), 4.0, noise=0.0, delay=0.04)
+    joints = tuple(truth.joints)
+    delay = CommandDelay(joints, shared=True)
+    replay = window_replay(log, truth, delay)
+    outputs = replay.predict(np.array([[0.0], [0.04]]))
+    inside = np.isfinite(outputs.position[0, :, 0])
+    error = [np.abs(p[inside] - joint_truth(truth, replay)[inside]).max() for p in outputs.position]
+    assert error[1] < 1e-6
+    assert error[0] > 1e-3
+
+
+def test_a_torque_known_in_advance_acts_in_every_window() -> None:
+    log, truth = quiet_walk()
+    push = ConstantForce(("HeadYaw",))
+    replay = window_replay(log, truth, push)
+    plain, pushed = replay.predict(np.array([[0.0], [0.2]])).position
+    column = replay.index.joints.index("HeadYaw")
+    assert replay.windows is not None
+    for _, b in replay.windows.rows:
+        assert pushed[b - 1, column] - plain[b - 1, column] > 1e-3
+
+
+def test_a_change_of_the_start_moves_its_window_as_a_simulation_from_there_does() -> None:
+    log, truth = quiet_walk()
+    replay = window_replay(log, truth)
+    assert replay.windows is not None
+    joints = len(replay.index.joints)
+    change = np.zeros((2, BASE + 2 * joints))
+    change[0, 4], change[1, BASE + 3] = 0.01, 0.01
+    for w, outputs in replay.respond(np.zeros(0), change):
+        for k in range(2):
+            moved = replace(replay, windows=replay.windows.chosen(np.array([w])).moved(change[k : k + 1]))
+            a, b = replay.windows.rows[w]
+            assert np.array_equal(moved.predict(np.zeros((1, 0))).position[0, a:b], outputs.position[k])
+
+
+def test_samples_between_steps_are_read_where_they_are() -> None:
+    log, truth = quiet_walk()
+    late = replace(log, time=log.time + 0.0004 * (np.arange(len(log)) % 3))  # a clock that jitters
+    replay = window_replay(late, truth)
+    outputs = replay.predict(np.zeros((1, 0))).position[0]
+    inside = np.isfinite(outputs[:, 0])
+    # the states are those of the regular clock, so only the jitter's motion may differ
+    assert np.abs(outputs[inside] - joint_truth(truth, replay)[inside]).max() < 0.02
+
+
+def test_coordinates_of_a_start_share_simulations_only_in_limbs_without_a_foot() -> None:
+    log, truth = quiet_walk()
+    replay = window_replay(log, truth)
+    lanes = start_lanes(replay)
+    seen = [c for lane in lanes for c, _ in lane]
+    joints = len(replay.index.joints)
+    assert sorted(seen) == sorted({2, 3, 4, *range(6, BASE + 2 * joints)})  # all but place and yaw
+    assert len(lanes) < 45
+    for lane in lanes:
+        if len(lane) > 1:
+            moved = np.concatenate([columns for _, columns in lane])
+            assert len(moved) == len(set(moved.tolist()))
+            names = {replay.index.joints[i] for i in moved}
+            assert not any("Hip" in n or "Knee" in n or "Ankle" in n for n in names)
+
+
+def test_on_a_slope_gravity_and_the_base_tilt_together() -> None:
+    tilt = (0.03, -0.02)
+
+    def slope(spec: mujoco.MjSpec) -> None:
+        x, y = tilt
+        spec.option.gravity = 9.81 * np.array([-np.sin(y) * np.cos(x), np.sin(x), -np.cos(y) * np.cos(x)])
+
+    log, truth = record_walk(Gait(), 4.0, noise=0.0, edit=slope)
+    effect = GravityTilt(("robot",))
+    replay = window_replay(log, truth, effect)
+    assert replay.windows is not None
+    # what an inertial unit knows: the attitude to gravity, as if the floor were level
+    unit = np.array([[0.0, 0.0, -9.81]])
+    x, y = tilt
+    own = 9.81 * np.array([-np.sin(y) * np.cos(x), np.sin(x), -np.cos(y) * np.cos(x)])
+    back = on_slope(replay.windows, own, np.repeat(unit, len(replay.windows), axis=0))
+    outputs = replace(replay, windows=back).predict(np.array([[0.0, 0.0], tilt]))
+    inside = np.isfinite(outputs.position[0, :, 0])
+    flat, sloped = (np.sqrt(np.mean((p[inside] - joint_truth(truth, replay)[inside]) ** 2)) for p in outputs.position)
+    assert sloped < 0.3 * flat
+
+
+@pytest.mark.parametrize(("effect", "value"), [(FootFriction, 0.3), (FootCompliance, 3.0)])
+def test_contact_effects_show_on_a_walk(effect: type[Effect], value: float) -> None:
+    log, truth = quiet_walk()
+    replay = window_replay(log, truth, effect(("robot",)))
+    plain, changed = replay.predict(np.array([[1.0], [value]])).position
+    inside = np.isfinite(plain[:, 0])
+    legs = [i for i, j in enumerate(replay.index.joints) if "Ankle" in j or "Hip" in j]
+    assert np.abs(plain[inside] - joint_truth(truth, replay)[inside]).max() < 1e-6  # neutral
+    assert np.abs((changed - plain)[inside][:, legs]).max() > 1e-3
+
+
+# --- uncertain starts -----------------------------------------------------------------------------------
+
+
+def toy_marginal(rng: np.random.Generator) -> tuple[Marginal, Target, np.ndarray]:
+    n, d = 12, 3
+    response = rng.normal(size=(d, n, 1))
+    marginal = Marginal(np.array([[0, n]]), ({"position": response},), np.ones(1), np.zeros((1, d)))
+    target = Target(
+        "position", ("a",), np.array([0]), np.zeros((n, 1)), (NoiseFloor(0.5, "unknown", 0.0),), np.array([0.5]),
+        np.ones((n, 1), dtype=bool),
+    )  # fmt: skip
+    return marginal, target, response[:, :, 0].T
+
+
+def test_whitening_is_that_of_the_gaussian_with_the_start_integrated_out() -> None:
+    rng = np.random.default_rng(0)
+    marginal, target, response = toy_marginal(rng)
+    (projection,) = projections(marginal, (target,))
+    covariance = np.eye(12) + (response / 0.5) @ (response / 0.5).T
+    residual = rng.normal(size=(5, 12))
+    white = projection.whiten(residual)
+    expected = np.einsum("mi,ij,mj->m", residual, np.linalg.inv(covariance), residual)
+    assert np.sum(white**2, axis=1) == pytest.approx(expected)
+    draws = rng.normal(size=(4000, 12)) + rng.normal(size=(4000, 3)) @ (response / 0.5).T
+    assert np.cov(projection.whiten(draws).T) == pytest.approx(np.eye(12), abs=0.12)
+
+
+def test_a_start_moved_within_its_uncertainty_leaves_the_likelihood_as_it_was() -> None:
+    rng = np.random.default_rng(2)
+    marginal, target, response = toy_marginal(rng)
+    residual = rng.normal(size=(1, 12))
+    shift = rng.normal(size=(1, 3))
+    (before,) = projections(marginal, (target,))
+    (after,) = projections(replace(marginal, shift=shift), (target,))
+    moved = residual - shift @ (response / 0.5).T  # simulated from the new start
+    assert after.whiten(moved) == pytest.approx(before.whiten(residual))
+
+
+def test_an_uncertain_start_costs_information_and_never_invents_any() -> None:
+    marginal, target, _ = toy_marginal(np.random.default_rng(3))
+    (projection,) = projections(marginal, (target,))
+    signal = np.random.default_rng(4).normal(size=(20, 12))
+    assert np.all(np.linalg.norm(projection.whiten(signal), axis=1) <= np.linalg.norm(signal, axis=1))
+
+
+# --- walks ----------------------------------------------------------------------------------------------
+
+
+@cache
+def laid_walk() -> Walk:
+    return lay_windows(make_walk(load_robot("nao"), plain_walk()[0]), 0.2, (7.0,))
+
+
+def test_windows_tile_a_walk_and_do_not_cross_the_border_of_what_is_held_out() -> None:
+    walk = laid_walk()
+    assert walk.windows is not None
+    rows = walk.windows.rows
+    assert np.all(rows[:, 1] - rows[:, 0] == 10)
+    assert np.all(rows[1:, 0] >= rows[:-1, 1])
+    assert not np.any((walk.time[rows[:, 0]] < 6.99) & (walk.time[rows[:, 1] - 1] > 7.0))
+    assert covered(walk).mean() > 0.95
+
+
+def test_a_part_of_a_walk_keeps_the_windows_that_lie_in_it() -> None:
+    walk = laid_walk()
+    part = walk.window(100, 200)
+    assert isinstance(part, Walk)
+    assert part.windows is not None
+    assert walk.windows is not None
+    assert len(part.windows) == 10
+    assert part.windows.rows.min() == 0
+    assert part.windows.rows.max() == 100
+    k = int(np.flatnonzero(walk.windows.rows[:, 0] == 100)[0])
+    assert np.array_equal(part.windows.position[0], walk.windows.position[k])
+    assert part.base is not None
+    assert len(part.base.time) == 100
+
+
+def test_a_fall_ends_a_walk() -> None:
+    log, _ = record_walk(Gait(), 5.0, push=lambda t: np.array([0.0, 25.0 * (3.0 < t < 3.4), 0.0]))
+    walk = make_walk(load_robot("nao"), log)
+    assert walk.base is not None
+    assert any(e.kind == "fall" for e in walk.base.events)
+    assert 2.5 < walk.time[-1] < 3.6
+    assert len(walk.base.time) == len(walk)
+
+
+def test_the_length_of_windows_weighs_information_against_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(walk_module, "LENGTHS", (0.1, 0.2))
+    monkeypatch.setattr(walk_module, "TRIED", 4)
+    walk = cut_up(load_robot("nao"), make_walk(load_robot("nao"), plain_walk()[0]), (7.0,), threads=2)
+    assert [c.seconds for c in walk.choices] == pytest.approx([0.2, 0.1])  # the model is right: longer is better
+    longer, shorter = walk.choices
+    assert longer.information > shorter.information
+    assert longer.misfit < 2.0
+    assert longer.score == pytest.approx(longer.information - np.log(longer.misfit))
+    assert walk.seconds == pytest.approx(0.2)
+
+
+def test_a_log_with_too_little_walking_is_refused() -> None:
+    log, _ = plain_walk()
+    with pytest.raises(LogError, match="record more walking"):
+        lay_windows(make_walk(load_robot("nao"), log.window(0, 30)), 0.2)
+
+
+# --- fits -----------------------------------------------------------------------------------------------
+
+
+def heavier(name: str, factor: float):  # type: ignore[no-untyped-def]
+    def edit(spec: mujoco.MjSpec) -> None:
+        geom = next(g for g in spec.body(name).geoms if g.mass > 0)
+        geom.mass *= factor
+
+    return edit
+
+
+@cache
+def heavy_study() -> Study:
+    log, _ = record_walk(Gait(), 8.0, edit=heavier("LKneePitch", 1.4))
+    return make_study(load_robot("nao"), [log], threads=2)
+
+
+def test_a_mass_is_found_on_a_walk_within_its_interval() -> None:
+    found = fit(heavy_study(), ["mass:LKneePitch,RKneePitch", "kp:*=shared"])
+    truth = {"mass:RKneePitch": 1.0, "mass:LKneePitch": 1.4, "kp:*": 1.0}
+    assert {e.name for e in found.estimates} == set(truth)
+    for estimate in found.estimates:
+        low, high = estimate.ci95
+        assert low - 0.02 <= truth[estimate.name] <= high + 0.02, estimate
+        assert estimate.std < 0.1
+    before, nominal = found.before.holdout["position"], found.nominal.holdout["position"]
+    assert before.chi2 < nominal.chi2
+    assert before.rmse < 1.5 * before.floor
+
+
+def test_a_free_and_a_held_log_are_fitted_together() -> None:
+    log, _ = record_walk(Gait(), 5.0)
+    held = replace(log, meta=replace(log.meta, mount="fixed"))
+    study = make_study(load_robot("nao"), [log, held], threads=2)
+    problem = study.train_problem(study.declare(["mass:LKneePitch", "mass:RShoulderRoll"]))
+    walk, gantry = (e.replay for e in problem.episodes)
+    assert isinstance(walk, WindowReplay)
+    assert not isinstance(gantry, WindowReplay)
+    assert walk.model.nq == gantry.model.nq + 7
+    # a free base lets every parameter reach every joint
+    assert all(len(group) == 1 for group in problem.groups)
+    assert np.isfinite(problem.residuals(problem.start[None])).all()
+
+
+def test_a_walk_and_a_held_log_together_tell_more_than_either() -> None:
+    robot = load_robot("nao")
+    walked, _ = record_walk(Gait(), 4.0)
+    held = replay_log(robot, replace(walked, meta=replace(walked.meta, mount="fixed")), numerics=Numerics("RK4", 0.005))
+    rng = np.random.default_rng(5)
+    noisy = {k: v for k, v in held.channels.items() if k.startswith("command")}
+    for name in held.joints("position"):
+        noisy[f"position.{name}"] = held.channels[f"position.{name}"] + rng.normal(scale=5e-4, size=len(held))
+    held = replace(held, channels=noisy)
+
+    def deviations(*logs: Log) -> np.ndarray:
+        study = make_study(robot, logs, numerics=Numerics("RK4", 0.005), threads=2)
+        problem = study.train_problem(study.declare(["mass:LKneePitch", "mass:LHipPitch"]))
+        residual, jacobian = linearise(problem, problem.start, step=study.stencil)
+        found = estimates(problem.parameters, problem.start, jacobian, residual, problem.blocks)
+        return np.array([e.std for e in found])
+
+    together, alone = deviations(walked, held), (deviations(walked), deviations(held))
+    assert np.all(together < 1.02 * np.minimum(*alone)), (together, alone)
+    assert together.sum() < 0.95 * np.minimum(*alone).sum()
+
+
+def test_the_recorded_fall_is_not_scored(shared_data: Path) -> None:
+    folder = shared_data / "nao_walk"
+    robot = load_robot(str(folder / "nominal_free.xml"))
+    study = make_study(robot, [read_log(folder / "walk_fall.parquet")], threads=2)
+    assert study.train[0].time[-1] < 9.0
+    assert all(log.time[-1] < 9.0 for log in study.holdout)

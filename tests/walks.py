@@ -1,0 +1,124 @@
+"""Walks of the built-in Nao, recorded from MuJoCo with what the sensors would show, and with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import mujoco
+import numpy as np
+
+from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.gait import Gait, gait
+from sysid_btr.models.robot import load_robot
+
+TICK = 2 * np.pi / 4096
+PERIOD = 0.02
+STEP = 0.001
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True motion at the samples: base (n, 3), rotation (n, 3, 3), joints (n, j), and the model."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    rotation: np.ndarray
+    rate: np.ndarray
+    joint_position: np.ndarray
+    joint_velocity: np.ndarray
+    joints: tuple[str, ...]
+    model: mujoco.MjModel
+
+
+def record_walk(
+    parameters: Gait,
+    seconds: float,
+    *,
+    seed: int = 0,
+    noise: float = 1.0,
+    edit: Callable[[mujoco.MjSpec], None] | None = None,
+    push: Callable[[float], np.ndarray] | None = None,
+    delay: float = 0.0,
+) -> tuple[Log, Truth]:
+    """A log of a walk, and the truth.
+
+    Parameters
+    ----------
+    noise : factor on the sensors' noise.
+    edit : changes the robot that walks.
+    push : time -> force on the torso, (3,) N.
+    delay : of the commands, s, a multiple of the step.
+    """
+    spec = load_robot("nao").make_spec()
+    spec.option.timestep = STEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    if edit is not None:
+        edit(spec)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(seed)
+    joints = tuple(model.actuator(i).name for i in range(model.nu))
+    address = [model.jnt_qposadr[model.joint(j).id] for j in joints]
+    dof = [model.jnt_dofadr[model.joint(j).id] for j in joints]
+    time = np.arange(0, seconds - 1e-9, PERIOD)
+    commands = np.stack([gait(parameters, time)[j] for j in joints], axis=1)
+    data.qpos[address] = commands[0]
+    mujoco.mj_forward(model, data)
+    data.qpos[2] -= min(data.body(f"{s}AnkleRoll").xpos[2] - 0.05 for s in "LR")
+    sensors = [model.sensor(i).name for i in range(model.nsensor) if not model.sensor(i).name.startswith("position_")]
+    rows: dict[str, list[np.ndarray | float]] = {}
+    inner = round(PERIOD / STEP)
+    late = round(delay / STEP)
+    history = [commands[0]] * late
+    for k in range(len(time)):
+        mujoco.mj_forward(model, data)
+        rotation = data.body("Torso").xmat.reshape(3, 3).copy()
+        state = {
+            "position": data.qpos[:3].copy(),
+            "velocity": data.qvel[:3].copy(),
+            "rotation": rotation,
+            "rate": data.qvel[3:6].copy(),
+            "joint_position": data.qpos[address].copy(),
+            "joint_velocity": data.qvel[dof].copy(),
+        }
+        for name, value in {**state, **{s: data.sensor(s).data.copy() for s in sensors}}.items():
+            rows.setdefault(name, []).append(value)
+        for _ in range(inner):
+            history.append(commands[k])
+            data.ctrl[:] = history.pop(0)
+            if push is not None:
+                data.body("Torso").xfrc_applied[:3] = push(data.time)
+            mujoco.mj_step(model, data)
+    table = {name: np.array(values) for name, values in rows.items()}
+    channels = {f"command.{j}": commands[:, i] for i, j in enumerate(joints)}
+    seen = table["joint_position"] + noise * rng.normal(scale=4e-4, size=table["joint_position"].shape)
+    if noise:
+        seen = np.round(seen / TICK) * TICK
+    channels |= {f"position.{j}": seen[:, i] for i, j in enumerate(joints)}
+    n = len(time)
+    for i, axis in enumerate("xyz"):
+        channels[f"imu.gyro_{axis}"] = table["gyro"][:, i] + noise * rng.normal(scale=0.01, size=n)
+        channels[f"imu.acc_{axis}"] = table["acc"][:, i] + noise * rng.normal(scale=0.05, size=n)
+    turn = table["rotation"]
+    channels["imu.angle_x"] = np.arctan2(turn[:, 2, 1], turn[:, 2, 2]) + noise * rng.normal(scale=3e-3, size=n)
+    channels["imu.angle_y"] = -np.arcsin(turn[:, 2, 0]) + noise * rng.normal(scale=3e-3, size=n)
+    for name in sensors:
+        if name.startswith("force_"):
+            channels[f"force.{name.removeprefix('force_')}"] = table[name][:, 0]
+    log = Log(
+        time=time,
+        channels=channels,
+        meta=LogMeta(robot="nao", mount="free", sample_period=PERIOD, source="simulated"),
+        episode=np.zeros(n, dtype=np.int64),
+    )
+    motion = {name: table[name] for name in Truth.__dataclass_fields__ if name in table}
+    return log, Truth(**motion, joints=joints, model=model)
+
+
+@cache
+def plain_walk() -> tuple[Log, Truth]:
+    """Ten seconds of the default walk."""
+    return record_walk(Gait(), 10.0)
