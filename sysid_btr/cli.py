@@ -17,21 +17,29 @@ from sysid_btr.request import (
     assignments,
     declared,
     find_robot,
+    known_starts,
+    pairs,
+    params_digest,
     read_logs,
     remark,
     replay_targets,
     split_names,
     start_values,
     what_can_be_freed,
+    with_params,
 )
-from sysid_btr.session import Folder, Interrupted, ProgressLine, interruptible, write_all
+from sysid_btr.session import Folder, Interrupted, ProgressLine, as_model, interruptible, write_all
 
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
+    from sysid_btr.estimators.journal import Journal
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
+    from sysid_btr.models.modifier import Modifier
+    from sysid_btr.models.robot import Robot
+    from sysid_btr.posterior.posterior import Posterior
 
-    Job = Callable[[Study, ProgressLine], Fit | Closing]
+    Job = Callable[[Study, ProgressLine], Fit | Closing | Posterior]
 
 EXIT_CODES = """
 Exit codes: 0 done; 1 a defect of this program; 2 usage; 3 a log cannot be used; 4 the model cannot be used or
@@ -147,6 +155,14 @@ Starts = Annotated[
         help="Where the search begins, by parameter name or glob, e.g. mass:slider=0.7; repeatable.",
     ),
 ]
+Params = Annotated[
+    Path | None,
+    typer.Option(
+        "--params",
+        metavar="FILE",
+        help="params.json of an earlier run, or its folder: begin from its values (replay: with them, effects too).",
+    ),
+]
 Bounds = Annotated[
     list[str] | None,
     typer.Option(
@@ -163,18 +179,42 @@ Channels = Annotated[
 ]
 EstimatorName = Annotated[
     str,
-    typer.Option("--estimator", metavar="NAME", help="lsq, ga, cmaes, nlopt:ALGORITHM, or one installed."),
+    typer.Option(
+        "--estimator",
+        metavar="NAME[+NAME..]",
+        help="lsq, ga, cmaes, nlopt:ALGORITHM, emcee, or one installed; joined by +, each goes on from the best of "
+        "the one before (cmaes+lsq).",
+    ),
 ]
 DistanceName = Annotated[
     str,
     typer.Option(
         "--distance",
         metavar="NAME",
-        help="What is minimised: likelihood (squares over noise); mse or phi2[:BINS], with ga, cmaes or nlopt.",
+        help="What is minimised: likelihood (squares over noise); or mse, phi1, phi2[:BINS], wasserstein, with ga, "
+        "cmaes or nlopt.",
     ),
 ]
 MaxEvaluations = Annotated[
     int | None, typer.Option("--max-evaluations", min=1, help="Stop the search after this many replays.")
+]
+Profiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--profile",
+        metavar="NAME",
+        help="Also follow the likelihood along this parameter (name or glob), the others fitted anew at each "
+        "point: profile_NAME.png; repeatable.",
+    ),
+]
+Priors = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--priors",
+        metavar="NAME=PRIOR",
+        help="Prior of a parameter, a glob or a whole field: uniform, normal(MEAN, STD), lognormal(MEDIAN, SPREAD). "
+        "[default: the model's table, else uniform within the bounds]",
+    ),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")]
 Threads = Annotated[int, typer.Option("--threads", min=0, help="Worker threads; 0 for all cores.")]
@@ -184,7 +224,7 @@ Out = Annotated[
         "--out",
         "-o",
         metavar="DIR",
-        help="Folder for result.json, overlay.png, report.html and the journal. "
+        help="Folder for result.json, model.xml, params.json, overlay.png, report.html and the journal. "
         "Without it nothing is written: results go to stdout only.",
     ),
 ]
@@ -192,6 +232,12 @@ Resume = Annotated[
     bool, typer.Option("--resume", help="Go on where an interrupted run with the same --out stopped.")
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace earlier results in --out.")]
+Render = Annotated[
+    bool,
+    typer.Option(
+        "--render", help="Also draw log, model before and model after, side by side: render.png and render.gif."
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json instead of tables.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")]
 
@@ -245,6 +291,137 @@ def validate(
         raise typer.Exit(LogError.exit_code)
 
 
+@app.command("import")
+def import_(
+    files: Annotated[
+        list[Path] | None, typer.Argument(metavar="FILE...", help="Foreign logs, or folders of bags and datasets.")
+    ] = None,
+    format_: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="auto (by content), naoqi, ros2, mcap, lerobot, csv (also Parquet), or one installed.",
+        ),
+    ] = "auto",
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="FILE", help="Mapping (TOML): columns, units, joints, topics, metadata."),
+    ] = None,
+    model: Model = None,
+    rename: Annotated[
+        list[str] | None,
+        typer.Option("--rename", metavar="A=B", help="Joint A of the file is joint B of the model; repeatable."),
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--unit", metavar="CHANNEL=UNIT", help="e.g. position=deg, time=ms, velocity.knee=rpm; repeatable."
+        ),
+    ] = None,
+    mount: Annotated[
+        str | None, typer.Option("--mount", metavar="fixed|free", help="Whether the torso was held or could move.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="The log to write (Parquet); without it nothing is written."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file at --out.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write the log although the validation finds errors, to repair it.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Make logs of other formats ones of this program, and check them; several files are episodes of one log.
+
+    Every column or topic that is not understood is told. A table whose columns cannot be guessed gets a mapping
+    file on standard output, to fill in. With errors in it the log is not written (exit 3), unless --force is given.
+    """
+    from sysid_btr.io.importers.base import MappingNeeded
+    from sysid_btr.io.importers.mapping import read_map, with_flags
+    from sysid_btr.io.importers.run import import_log
+    from sysid_btr.request import known_model, output_file, pairs
+
+    target = output_file(out, files or [], overwrite)
+    known = known_model(model)
+    told = with_flags(
+        read_map(mapping),
+        units=pairs("--unit", unit),
+        renames=pairs("--rename", rename),
+        meta={"mount": mount},
+    )
+    try:
+        imported = import_log(files or [], importer=format_, told=told, model=known)
+    except MappingNeeded as error:
+        proposed = error.propose(known.joints if known else None)
+        if as_json:
+            _print_json({"mapping": proposed})
+        else:
+            sys.stdout.write(proposed)
+        raise
+    for text in imported.remarks:
+        remark(text)
+    wanted = imported.usable or force
+    if target is not None and wanted:
+        from sysid_btr.io.parquet import write_log
+
+        write_log(imported.log, target, overwrite=overwrite)
+    written = target if wanted else None
+    if as_json:
+        from sysid_btr.report.imported import as_json as to_dict
+
+        _print_json(to_dict(imported, written))
+    else:
+        from sysid_btr.report.imported import summary
+        from sysid_btr.report.text import console, problems_table
+
+        screen = console(sys.stdout)
+        for line in summary(imported):
+            screen.print(line)
+        if imported.problems:
+            screen.print(problems_table(imported.problems))
+    if written is not None:
+        remark(f"log: {written}")
+    elif target is None:
+        remark("nothing is written without --out")
+    if imported.advice:
+        remark(f"what may put it right (check each): {' '.join(imported.advice)}")
+    if not imported.usable:
+        remark("the log has errors" + (", and is written all the same" if written else ": it is not written"))
+        raise typer.Exit(LogError.exit_code)
+
+
+@app.command()
+def init(
+    files: Annotated[list[Path] | None, typer.Argument(metavar="LOG...", help="Logs of one robot.")] = None,
+    model: Model = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="The study file to write; without it, standard output."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file at --out.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Write a study file to begin with: what the log holds, and what of the model it may tell, line by line.
+
+    It runs as it is: sysid-btr fit --config FILE, or close --config FILE.
+    """
+    from sysid_btr.identify.study_file import study_file
+    from sysid_btr.request import output_file, warn_of
+
+    robot = find_robot(model, None)
+    logs = read_logs(files)
+    target = output_file(out, files or [], overwrite)
+    warn_of(robot, logs)
+    text = study_file(robot, logs, model or robot.name, target)
+    if target is None:
+        sys.stdout.write(text)
+        return
+    Folder(target.parent).write(target.name, text)
+    remark(f"study file: {target}; next: sysid-btr close --config {target}")
+
+
 @app.command()
 def replay(
     model: Model = None,
@@ -255,6 +432,7 @@ def replay(
             "--set", metavar="PARAMETERS=VALUE", help="Change the model first, e.g. 'kp:*=0.9'; repeatable."
         ),
     ] = None,
+    params: Params = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Folder for the predicted logs.")
     ] = None,
@@ -276,13 +454,16 @@ def replay(
     logs = read_logs(log)
     parameters = dict(assignments("--set", set_))
     modifiers, values = set_parameters(robot, parameters)
+    numerics = None
+    if params is not None:
+        modifiers, values, numerics = with_params(params, robot, modifiers, values)
     targets = replay_targets(out, logs, overwrite)
-    study = make_study(robot, logs, holdout=logs, channels=COMPARED, threads=threads)
+    study = make_study(robot, logs, holdout=logs, channels=COMPARED, numerics=numerics, threads=threads)
     scores = score_problem(study.train_problem(modifiers), values)
     for path, one in zip(targets, logs, strict=False):
         from sysid_btr.io.parquet import write_log
 
-        predicted = replay_log(robot, one, parameters, numerics=study.numerics, threads=threads)
+        predicted = replay_log(robot, one, (modifiers, values), numerics=study.numerics, threads=threads)
         write_log(predicted, path, overwrite=overwrite)
     result = replay_result(study, scores, parameters, time.perf_counter() - began)
     if as_json:
@@ -307,16 +488,19 @@ def fit(
     free: Free = None,
     holdout: Holdout = None,
     start: Starts = None,
+    params: Params = None,
     bounds: Bounds = None,
     channels: Channels = None,
     estimator: EstimatorName = "lsq",
     distance: DistanceName = "likelihood",
     max_evaluations: MaxEvaluations = None,
+    profile: Profiles = None,
     seed: Seed = 0,
     threads: Threads = 0,
     out: Out = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    render: Render = False,
     as_json: Json = False,
     config: Config = None,
     debug: Debug = False,
@@ -326,16 +510,12 @@ def fit(
     Exit 5 if the search did not converge or the log tells none of the parameters; the results are written all
     the same.
     """
-    from sysid_btr.estimators import get_estimator
-    from sysid_btr.estimators.base import Budget
-    from sysid_btr.identify.fit import fit as fit_study
-    from sysid_btr.objectives.distance import get_distance
+    from sysid_btr.identify.profile import chosen_names, with_profiles
 
     robot = find_robot(model, bounds)
     if not free:
         raise UsageError(what_can_be_freed(robot))
-    chosen = get_estimator(estimator)
-    wanted = get_distance(distance)
+    search = _search(estimator, distance, max_evaluations, robot, start, params)
     request = Request(
         "fit",
         robot,
@@ -345,26 +525,120 @@ def fit(
         channels,
         threads,
         seed,
-        {"estimator": estimator, "distance": distance, "start": start or [], "bounds": bounds or []},
+        {
+            "estimator": estimator,
+            "distance": distance,
+            "start": start or [],
+            "bounds": bounds or [],
+            "params": params_digest(params),
+        },
     )
     keeper = Keeper.open(out, resume, overwrite, request)
+    _check_render(render, keeper)
 
     def job(study: Study, progress: ProgressLine) -> Fit:
         modifiers = study.declare(free)
+        wanted = chosen_names([p.name for m in modifiers for p in m.parameters], profile or [])
+        return with_profiles(search(study, modifiers, _generator(seed), keeper.journal, progress), wanted, progress)
+
+    _finish(request, keeper, job, as_json, render)
+
+
+@app.command()
+def posterior(
+    model: Model = None,
+    log: Logs = None,
+    free: Free = None,
+    holdout: Holdout = None,
+    start: Starts = None,
+    params: Params = None,
+    bounds: Bounds = None,
+    priors: Priors = None,
+    channels: Channels = None,
+    estimator: EstimatorName = "lsq",
+    distance: DistanceName = "likelihood",
+    ensembles: Annotated[
+        int, typer.Option("--ensembles", min=2, help="Independent ensembles; they must agree.")
+    ] = 2,
+    walkers: Annotated[
+        int | None, typer.Option("--walkers", min=1, help="Of each ensemble, even. [default: 2 (parameters + 1)]")
+    ] = None,
+    max_evaluations: Annotated[
+        int | None,
+        typer.Option(
+            "--max-evaluations", min=1, help="Stop sampling after this many replays, converged or not. [default: 20000]"
+        ),
+    ] = None,
+    seed: Seed = 0,
+    threads: Threads = 0,
+    out: Out = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    render: Render = False,
+    as_json: Json = False,
+    config: Config = None,
+    debug: Debug = False,
+) -> None:
+    """Fit, then draw the posterior of the parameters with real replays, until independent ensembles agree.
+
+    Writes posterior.nc (ArviZ), a corner plot, traces and predictions of held-out data with their bands. Exit 5 if
+    it has not converged when the replays are used up; the results are written all the same.
+    """
+    from sysid_btr.estimators.base import Budget
+    from sysid_btr.estimators.ensemble import walkers_for
+    from sysid_btr.posterior.export import check_installed
+    from sysid_btr.posterior.posterior import BUDGET
+    from sysid_btr.posterior.posterior import posterior as draw_posterior
+    from sysid_btr.posterior.priors import choose_priors
+    from sysid_btr.posterior.sampling import Settings
+
+    check_installed()
+    robot = find_robot(model, bounds)
+    if not free:
+        raise UsageError(what_can_be_freed(robot))
+    search = _search(estimator, distance, None, robot, start, params)
+    believed = dict(pairs("--priors", priors))
+    settings = Settings(ensembles=ensembles, walkers=walkers)
+    request = Request(
+        "posterior",
+        robot,
+        read_logs(log),
+        holdout,
+        free,
+        channels,
+        threads,
+        seed,
+        {
+            "estimator": estimator,
+            "distance": distance,
+            "start": start or [],
+            "bounds": bounds or [],
+            "params": params_digest(params),
+            "priors": believed,
+            "ensembles": ensembles,
+            "walkers": walkers,
+        },
+    )
+    keeper = Keeper.open(out, resume, overwrite, request)
+    _check_render(render, keeper)
+
+    def job(study: Study, progress: ProgressLine) -> Posterior:
+        modifiers = study.declare(free)
         parameters = [p for m in modifiers for p in m.parameters]
-        return fit_study(
-            study,
-            modifiers,
-            estimator=chosen,
-            rng=_generator(seed),
-            budget=Budget(evaluations=max_evaluations),
-            journal=keeper.journal,
+        choose_priors(parameters, believed, robot.priors)
+        walkers_for(len(parameters), walkers)
+        rng = _generator(seed)
+        return draw_posterior(
+            search(study, modifiers, rng, keeper.journal, progress),
+            priors=believed,
+            settings=settings,
+            rng=rng,
+            budget=BUDGET if max_evaluations is None else Budget(evaluations=max_evaluations),
+            journal=keeper.journal.section(),
             progress=progress,
-            start=start_values(parameters, start),
-            distance=wanted,
         )
 
-    _finish(request, keeper, job, as_json)
+    _finish(request, keeper, job, as_json, render)
 
 
 @app.command()
@@ -379,6 +653,7 @@ def close(
         ),
     ] = None,
     holdout: Holdout = None,
+    params: Params = None,
     bounds: Bounds = None,
     channels: Channels = None,
     seed: Seed = 0,
@@ -386,6 +661,7 @@ def close(
     out: Out = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    render: Render = False,
     as_json: Json = False,
     config: Config = None,
     debug: Debug = False,
@@ -412,10 +688,238 @@ def close(
         channels,
         threads,
         seed,
-        {"effects": names, "bounds": bounds or []},
+        {"effects": names, "bounds": bounds or [], "params": params_digest(params)},
     )
     keeper = Keeper.open(out, resume, overwrite, request)
-    _finish(request, keeper, _closing_job(parameters, names, seed, keeper), as_json)
+    _check_render(render, keeper)
+    _finish(request, keeper, _closing_job(parameters, names, seed, keeper, params), as_json, render)
+
+
+@app.command()
+def btr(
+    model: Model = None,
+    free: Free = None,
+    robot_sim: Annotated[
+        str | None,
+        typer.Option("--robot-sim", metavar="NAME|FILE", help="A simulation that stands for the robot, unseen."),
+    ] = None,
+    robot_set: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--robot-set", metavar="PARAMETERS=VALUE", help="Change that simulation, e.g. 'mass:*=1.1'; repeatable."
+        ),
+    ] = None,
+    exchange: Annotated[
+        Path | None,
+        typer.Option(
+            "--exchange", metavar="DIR", help="A real robot: commands to play appear here, recordings are waited for."
+        ),
+    ] = None,
+    wait: Annotated[
+        float | None,
+        typer.Option("--wait", metavar="S", help="Give up waiting for a recording after so long. [default: never]"),
+    ] = None,
+    iterations: Annotated[int, typer.Option("--iterations", min=1, help="At most.")] = 13,
+    trials: Annotated[
+        int | None,
+        typer.Option("--trials", min=1, help="Trials on the robot in each iteration. [default: 12; 2 without phi1]"),
+    ] = None,
+    duration: Annotated[float, typer.Option("--duration", metavar="S", help="Of a trial.")] = 3.0,
+    distance: Annotated[
+        str,
+        typer.Option(
+            "--distance",
+            metavar="NAME",
+            help="By which models are judged: phi1, phi2[:BINS], mse, wasserstein, likelihood.",
+        ),
+    ] = "phi1",
+    choice: Annotated[
+        str, typer.Option("--choice", metavar="NAME", help="Of the trials: fittest, or disagreement among models.")
+    ] = "fittest",
+    search: Annotated[
+        str, typer.Option("--search", metavar="NAME", help="For controllers: ga (the paper) or cmaes.")
+    ] = "ga",
+    model_search: Annotated[
+        str, typer.Option("--model-search", metavar="NAME", help="For models: cmaes, or ga (the paper).")
+    ] = "cmaes",
+    requirement: Annotated[
+        float | None, typer.Option("--requirement", metavar="M/S", help="Stop once the robot walks this fast.")
+    ] = None,
+    close: Annotated[
+        bool, typer.Option("--close", help="Look for missing effects where no model explains the robot's logs.")
+    ] = False,
+    bounds: Bounds = None,
+    seed: Seed = 0,
+    threads: Threads = 0,
+    out: Out = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    config: Config = None,
+    debug: Debug = False,
+) -> None:
+    """Back to Reality: search a controller in the model, try it on the robot, correct the model by that, again.
+
+    The robot is a simulation that the search does not see (--robot-sim), or a real one behind a folder (--exchange).
+    Exit 5 if model and robot lost hold of each other; the results are written all the same.
+    """
+    from sysid_btr.btr.command import Asked, run_btr
+    from sysid_btr.result import exit_code
+
+    asked = Asked(
+        find_robot(model, bounds),
+        free or [],
+        robot_sim,
+        dict(assignments("--robot-set", robot_set)),
+        exchange,
+        wait,
+        iterations,
+        trials,
+        duration,
+        distance,
+        choice,
+        search,
+        model_search,
+        requirement,
+        close,
+        seed,
+        threads,
+    )
+    result = run_btr(asked, out, resume, overwrite)
+    if as_json:
+        _print_json(result)
+    else:
+        from sysid_btr.report.text import console, show
+
+        show(result, console(sys.stdout))
+    if exit_code(result):
+        raise typer.Exit(exit_code(result))
+
+
+@app.command()
+def excite(
+    model: Model = None,
+    free: Free = None,
+    log: Logs = None,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the motion.")] = 10.0,
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Samples a second.")] = 100.0,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            "--noise",
+            metavar="RAD",
+            help="Noise floor of the position sensors (rad, m). [default: the log's, else that of a 12-bit encoder]",
+        ),
+    ] = None,
+    joints: Annotated[
+        list[str] | None,
+        typer.Option("--joints", metavar="GLOB[,GLOB..]", help="Joints that move. [default: all with a servo]"),
+    ] = None,
+    margin: Annotated[
+        float, typer.Option("--margin", metavar="FRACTION", help="Of each joint's range, left free at either end.")
+    ] = 0.05,
+    max_velocity: Annotated[
+        float | None,
+        typer.Option("--max-velocity", metavar="V", help="Of every joint. [default: 6 rad/s; slides 0.3 m/s]"),
+    ] = None,
+    max_acceleration: Annotated[
+        float | None,
+        typer.Option(
+            "--max-acceleration",
+            metavar="A",
+            help="Of every joint; less where the model limits a servo's torque. [default: 60 rad/s^2; slides 3 m/s^2]",
+        ),
+    ] = None,
+    criterion: Annotated[
+        str,
+        typer.Option(
+            "--criterion", metavar="NAME", help="mean (of the standard errors) or logdet (volume of the ellipsoid)."
+        ),
+    ] = "mean",
+    estimator: Annotated[
+        str, typer.Option("--estimator", metavar="NAME", help="Of the search: cmaes, ga, nlopt:ALGORITHM.")
+    ] = "cmaes",
+    max_evaluations: Annotated[int, typer.Option("--max-evaluations", min=1, help="Motions that are tried.")] = 400,
+    bounds: Bounds = None,
+    seed: Seed = 0,
+    threads: Threads = 0,
+    out: Out = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    config: Config = None,
+    debug: Debug = False,
+) -> None:
+    """Design a motion that tells chosen parameters best, with the intervals to expect before and after.
+
+    Writes excite.parquet, a log of commands to play on the robot (its torso held), result.json and a figure. What is
+    before is the motion of --log, which also tells the noise of the sensors, or else the first motion of the search.
+    Only the limits of the joints keep the motion from hitting the robot itself or the ground.
+    """
+    from sysid_btr.estimators.base import Budget
+    from sysid_btr.excite import outcome
+    from sysid_btr.excite.design import design, find_criterion, find_estimator
+    from sysid_btr.result import exit_code
+
+    robot = find_robot(model, bounds)
+    if not free:
+        raise UsageError(what_can_be_freed(robot))
+    if out is None:
+        raise UsageError("where shall the motion go? Give --out DIR")
+    if log and len(log) > 1:
+        raise UsageError("a motion is compared with one reference: give --log once")
+    reference = read_logs(log)[0] if log else None
+    asked: dict[str, Any] = {
+        "seconds": seconds,
+        "rate": rate,
+        "noise": noise,
+        "joints": split_names(joints),
+        "margin": margin,
+        "velocity": max_velocity,
+        "acceleration": max_acceleration,
+    }
+    chosen, score = find_estimator(estimator), find_criterion(criterion)
+    settings = {**asked, "estimator": estimator, "criterion": criterion, "bounds": bounds or []}
+    logs = [reference] if reference is not None else []
+    request = Request("excite", robot, logs, None, free, None, threads, seed, settings)
+    keeper = Keeper.open(out, resume, overwrite, request)
+    assert keeper.folder is not None
+    with ProgressLine("excite") as progress:
+        try:
+            found = design(
+                robot,
+                free,
+                reference=reference,
+                **asked,
+                criterion=score,
+                estimator=chosen,
+                rng=_generator(seed),
+                budget=Budget(evaluations=max_evaluations),
+                journal=keeper.journal,
+                progress=progress,
+                threads=threads,
+                search_context=outcome.first_interrupt_ends_the_search,
+            )
+        except Interrupted:
+            raise InterruptedRun(_interrupted(keeper, progress)) from None
+    result = outcome.make_result(found, seed=seed)
+    outcome.write_all(keeper.folder, found, result)
+    if as_json:
+        _print_json(result)
+    else:
+        from sysid_btr.report.text import console
+
+        screen = console(sys.stdout)
+        for part in outcome.show(result):
+            screen.print(part)
+    remark(f"motion: {keeper.folder.path / outcome.MOTION}. {outcome.WARNING}")
+    if outcome.interrupted(found):
+        raise InterruptedRun(
+            "interrupted; the best motion so far is written, and the same command with --resume goes on searching"
+        )
+    code = exit_code(result)
+    if code:
+        raise typer.Exit(code)
 
 
 @app.command()
@@ -461,13 +965,53 @@ def demo(
 # --- what the verbs share --------------------------------------------------------------------------------
 
 
-def _closing_job(parameters: list[str], effects: list[str], seed: int, keeper: Keeper) -> Job:
+def _search(
+    estimator: str,
+    distance: str,
+    max_evaluations: int | None,
+    robot: Robot,
+    start: list[str] | None,
+    params: Path | None,
+) -> Callable[[Study, Sequence[Modifier], Any, Journal, ProgressLine], Fit]:
+    """A fit as the flags ask for it, of whatever study."""
+    from sysid_btr.estimators import get_estimator
+    from sysid_btr.estimators.base import Budget
+    from sysid_btr.identify.fit import fit as fit_study
+    from sysid_btr.objectives.distance import get_distance
+
+    chosen, wanted = get_estimator(estimator), get_distance(distance)
+
+    def search(
+        study: Study, modifiers: Sequence[Modifier], rng: Any, journal: Journal, progress: ProgressLine
+    ) -> Fit:
+        parameters = [p for m in modifiers for p in m.parameters]
+        return fit_study(
+            study,
+            modifiers,
+            estimator=chosen,
+            rng=rng,
+            budget=Budget(evaluations=max_evaluations),
+            journal=journal,
+            progress=progress,
+            start=start_values(parameters, [*known_starts(params, robot, parameters), *(start or [])]),
+            distance=wanted,
+        )
+
+    return search
+
+
+def _closing_job(
+    parameters: list[str], effects: list[str], seed: int, keeper: Keeper, params: Path | None = None
+) -> Job:
     def job(study: Study, progress: ProgressLine) -> Closing:
         from sysid_btr.diagnosis.close import close as close_loop
 
+        modifiers = study.declare(parameters)
+        free = [p for m in modifiers for p in m.parameters]
         return close_loop(
             study,
-            parameters,
+            modifiers,
+            start=start_values(free, known_starts(params, study.robot, free)),
             effects=tuple(effects),
             rng=_generator(seed),
             journal=keeper.journal,
@@ -477,15 +1021,35 @@ def _closing_job(parameters: list[str], effects: list[str], seed: int, keeper: K
     return job
 
 
-def _finish(request: Request, keeper: Keeper, job: Job, as_json: bool) -> None:
-    code = _run(request, keeper, job, as_json)
+def _check_render(wanted: bool, keeper: Keeper) -> None:
+    if wanted and keeper.folder is None:
+        raise UsageError("--render writes pictures: give an --out folder for them")
+
+
+def _draw(folder: Folder, outcome: Fit | Closing) -> None:
+    from sysid_btr.report.render import CannotRenderError, save_pictures
+
+    try:
+        pictures = save_pictures(folder, outcome)
+    except CannotRenderError as error:
+        remark(
+            f"no pictures: nothing here draws off-screen ({error}). Install a software driver (Debian, Ubuntu: "
+            "libegl1 and libgl1-mesa-dri, or libosmesa6) or name a working one in MUJOCO_GL; all else is written."
+        )
+        return
+    remark(f"pictures: {', '.join(map(str, pictures))}")
+
+
+def _finish(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool = False) -> None:
+    code = _run(request, keeper, job, as_json, render)
     if code:
         raise typer.Exit(code)
 
 
-def _run(request: Request, keeper: Keeper, job: Job, as_json: bool) -> int:
+def _run(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool = False) -> int:
     """Do the work, write and print what it found; the exit code."""
     from sysid_btr.result import exit_code, make_result
+    from sysid_btr.writeback.write import describe_model
 
     began = time.perf_counter()
     with ProgressLine(request.kind) as progress:
@@ -497,6 +1061,10 @@ def _run(request: Request, keeper: Keeper, job: Job, as_json: bool) -> int:
     if keeper.folder is not None:
         page = write_all(keeper.folder, outcome, result)
         remark(f"report: {page}")
+        if render:
+            _draw(keeper.folder, as_model(outcome))
+    else:
+        describe_model(as_model(outcome), result)
     if as_json:
         _print_json(result)
     else:

@@ -25,18 +25,44 @@ class StudyFile(BaseModel):
     fit: str | list[str] | None = None
     effects: str | list[str] | None = None
     start: dict[str, float] | None = None
+    params: str | None = None
     bounds: dict[str, tuple[float, float]] | None = Field(default=None)
+    priors: dict[str, str] | None = None
     set: dict[str, float] | None = None
     channels: str | list[str] | None = None
     estimator: str | None = None
     distance: str | None = None
     max_evaluations: int | None = None
+    ensembles: int | None = None
+    walkers: int | None = None
+    profile: str | list[str] | None = None
+    robot_sim: str | None = None
+    robot_set: dict[str, float] | None = None
+    exchange: str | None = None
+    wait: float | None = None
+    iterations: int | None = None
+    trials: int | None = None
+    duration: float | None = None
+    choice: str | None = None
+    search: str | None = None
+    model_search: str | None = None
+    requirement: float | None = None
+    close: bool | None = None
+    seconds: float | None = None
+    rate: float | None = None
+    noise: float | None = None
+    joints: str | list[str] | None = None
+    margin: float | None = None
+    max_velocity: float | None = None
+    max_acceleration: float | None = None
+    criterion: str | None = None
     seed: int | None = None
     threads: int | None = None
     out: str | None = None
     json_: bool | None = Field(default=None, alias="json")
     resume: bool | None = None
     overwrite: bool | None = None
+    render: bool | None = None
 
     @field_validator("bounds", mode="before")
     @classmethod
@@ -56,15 +82,48 @@ class StudyFile(BaseModel):
             "channels": _listed(self.channels),
             "start": [f"{name}={value!r}" for name, value in (self.start or {}).items()],
             "set_": [f"{name}={value!r}" for name, value in (self.set or {}).items()],
+            "robot_set": [f"{name}={value!r}" for name, value in (self.robot_set or {}).items()],
+            "robot_sim": None if self.robot_sim is None else _beside(folder, self.robot_sim),
             "bounds": [f"{name}={low!r}:{high!r}" for name, (low, high) in (self.bounds or {}).items()],
+            "priors": [f"{name}={prior}" for name, prior in (self.priors or {}).items()],
+            "profile": _listed(self.profile),
+            "joints": _listed(self.joints),
             "model": None if self.model is None else _beside(folder, self.model),
+            "params": None if self.params is None else _beside(folder, self.params),
             **{
                 name: getattr(self, name)
-                for name in ("estimator", "distance", "max_evaluations", "seed", "threads", "out")
+                for name in (
+                    "estimator",
+                    "distance",
+                    "max_evaluations",
+                    "ensembles",
+                    "walkers",
+                    "exchange",
+                    "wait",
+                    "iterations",
+                    "trials",
+                    "duration",
+                    "choice",
+                    "search",
+                    "model_search",
+                    "requirement",
+                    "close",
+                    "seconds",
+                    "rate",
+                    "noise",
+                    "margin",
+                    "max_velocity",
+                    "max_acceleration",
+                    "criterion",
+                    "seed",
+                    "threads",
+                    "out",
+                )
             },
             "as_json": self.json_,
             "resume": self.resume,
             "overwrite": self.overwrite,
+            "render": self.render,
         }
         return {name: value for name, value in flags.items() if value is not None and value != []}
 

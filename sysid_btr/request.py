@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.estimators.journal import Journal
     from sysid_btr.identify.study import Study
+    from sysid_btr.io.importers.run import KnownModel
     from sysid_btr.io.log import Log
-    from sysid_btr.models.modifier import Parameter
+    from sysid_btr.models.modifier import Modifier, Parameter
     from sysid_btr.models.robot import Robot
+    from sysid_btr.replay.engine import Numerics
 
 DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
 """What `close` frees where nothing is said: a wrong mass or gain must not pass for an effect."""
@@ -183,7 +185,7 @@ def what_can_be_freed(robot: Robot) -> str:
     from sysid_btr.models.robot import body_names, joint_names, servo_joints
 
     fields: dict[str, list[str]] = {}
-    for name, cls in FIELDS.items():
+    for name, cls in {**FIELDS, **robot.fields}.items():
         fields.setdefault(cls.scope, []).append(name)
     lines = [
         f"what shall be fitted? Give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has",
@@ -229,6 +231,45 @@ def start_values(parameters: Sequence[Parameter], given: list[str] | None) -> Fl
     if problems:
         raise UsageError("--start: " + "\n  ".join(problems))
     return values
+
+
+def params_digest(path: Path | None) -> str | None:
+    """Digest of a parameter file that a search begins from."""
+    from sysid_btr.io.parquet import sha256
+    from sysid_btr.session import PARAMS
+
+    if path is None:
+        return None
+    file = path / PARAMS if path.is_dir() else path
+    return sha256(file) if file.is_file() else None
+
+
+def known_starts(path: Path | None, robot: Robot, parameters: Sequence[Parameter]) -> list[str]:
+    """``NAME=VALUE`` texts from a parameter file, for what is free; says which of its values are not used."""
+    if path is None:
+        return []
+    from sysid_btr.writeback.params import read_params, starts_from
+
+    given, unused = starts_from(read_params(path, robot), parameters)
+    if unused:
+        remark(f"--params: not free here, and so not used: {', '.join(unused)}")
+    return given
+
+
+def with_params(
+    path: Path, robot: Robot, modifiers: Sequence[Modifier], values: FloatArray
+) -> tuple[tuple[Modifier, ...], FloatArray, Numerics]:
+    """A model of an earlier run, further changed by modifiers with their values; and its numerics."""
+    import numpy as np
+
+    from sysid_btr.writeback.params import read_params
+
+    params = read_params(path, robot)
+    taken = {(m.name, place) for m in params.modifiers for place in m.places}
+    twice = [f"{m.name}:{place}" for m in modifiers for place in m.places if (m.name, place) in taken]
+    if twice:
+        raise UsageError(f"given by --set and by --params: {', '.join(twice)}; give one of the two")
+    return (*params.modifiers, *modifiers), np.concatenate([params.values, values]), params.numerics
 
 
 def assignments(flag: str, given: list[str] | None) -> list[tuple[str, float]]:
@@ -291,3 +332,49 @@ def replay_targets(out: Path | None, logs: Sequence[Log], overwrite: bool) -> li
     except OSError as error:
         raise UsageError(f"--out {out} cannot be created: {error.strerror}; choose another folder") from error
     return targets
+
+
+def known_model(name: str | None) -> KnownModel | None:
+    """What an import wants to know of the robot called for, if one is."""
+    if name is None:
+        return None
+    from sysid_btr.io.importers.run import KnownModel
+    from sysid_btr.models.robot import joint_names, joint_ranges, load_robot
+
+    robot = load_robot(name)
+    model = robot.compile()
+    joints = joint_names(robot)
+    sliding = tuple(joint for joint in joints if int(model.joint(joint).type[0]) == 2)
+    return KnownModel(robot.name, joints, joint_ranges(robot), sliding)
+
+
+def pairs(flag: str, given: list[str] | None) -> list[tuple[str, str]]:
+    """``A=B`` texts of a flag as pairs."""
+    split = [text.partition("=") for text in given or ()]
+    wrong = [
+        f"{flag} {text}: expected A=B" for text, (a, _, b) in zip(given or (), split, strict=True) if not (a and b)
+    ]
+    if wrong:
+        raise UsageError("\n".join(wrong))
+    return [(a, b) for a, _, b in split]
+
+
+def output_file(out: Path | None, sources: Sequence[Path], overwrite: bool) -> Path | None:
+    """The one file that a verb writes; refused before any work if something is in the way."""
+    if out is None:
+        return None
+    if out.is_dir():
+        raise UsageError(f"--out {out} is a folder; give the name of a file in it")
+    if any(out.exists() and source.exists() and out.samefile(source) for source in sources):
+        raise UsageError(f"--out {out} is also read, and is not overwritten; choose another name")
+    if out.exists() and not overwrite:
+        raise UsageError(f"--out {out} exists; --overwrite replaces it, or choose another name")
+    if not out.parent.is_dir():
+        raise UsageError(f"--out {out}: the folder {out.parent} does not exist; create it first")
+    return out
+
+
+def warn_of(robot: Robot, logs: Iterable[Log]) -> None:
+    """Remarks of the validation on logs that can be used all the same."""
+    for log in logs:
+        _warn(robot, log)

@@ -23,9 +23,11 @@ if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.intervals import Estimate
+    from sysid_btr.identify.profile import Profile
     from sysid_btr.identify.scores import ChannelScore, Scores
     from sysid_btr.identify.study import Study
     from sysid_btr.models.robot import Robot
+    from sysid_btr.posterior.posterior import Posterior
 
 SCHEMA = "sysid_btr.result/1"
 CHANNEL_UNITS = {
@@ -36,12 +38,12 @@ CHANNEL_UNITS = {
 """Unit of a channel for hinges and for slides."""
 
 
-def make_result(outcome: Fit | Closing, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
+def make_result(outcome: Fit | Closing | Posterior, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
     """The content of result.json.
 
     Parameters
     ----------
-    outcome : what `fit` or `close` returned.
+    outcome : what `fit`, `close` or `posterior` returned.
     seed : of the generator the estimator was given.
     wall_s : wall time to record, s; default that of the outcome.
 
@@ -52,8 +54,12 @@ def make_result(outcome: Fit | Closing, *, seed: int = 0, wall_s: float | None =
         ``before``.
     """
     from sysid_btr.identify.fit import Fit
+    from sysid_btr.posterior.posterior import Posterior
 
-    found = _of_fit(outcome) if isinstance(outcome, Fit) else _of_closing(outcome)
+    if isinstance(outcome, Posterior):
+        found = _of_posterior(outcome)
+    else:
+        found = _of_fit(outcome) if isinstance(outcome, Fit) else _of_closing(outcome)
     study = outcome.study
     plain: dict[str, Any] = clean(
         {
@@ -78,10 +84,37 @@ def _provenance(study: Study) -> dict[str, Any]:
             "chosen": str(study.numerics),
         },
         "channels": study.channels,
+        **({"walks": _walks(study)} if study.free else {}),
         "versions": versions(),
         "logs": _logs(study),
         "model": model_entry(study.robot),
     }
+
+
+def _walks(study: Study) -> list[dict[str, Any]]:
+    """How each log of a free base was cut up, and what its base state lacks."""
+    from sysid_btr.identify.walk import Walk
+
+    return [
+        {
+            "path": None if log.path is None else str(log.path),
+            "part": part,
+            "window": log.seconds,
+            "windows": len(log.windows),
+            "counted_less": int(np.sum(log.marginal.weight < COUNTED_LESS)) if log.marginal is not None else 0,
+            "windows_tried": [asdict(choice) for choice in log.choices],
+            "events": [str(event) for event in log.base.events],
+            "used_until": float(log.time[-1]),
+            "lost": log.base.lost,
+        }
+        for part, logs in (("train", study.train), ("holdout", study.holdout))
+        for log in logs
+        if isinstance(log, Walk) and log.windows is not None and log.base is not None
+    ]
+
+
+COUNTED_LESS = 0.9
+"""Weight below which a window of a walk counts as one that the model does not explain."""
 
 
 def _of_fit(fit: Fit) -> dict[str, Any]:
@@ -103,7 +136,89 @@ def _of_fit(fit: Fit) -> dict[str, Any]:
         "candidates": [],
         "steps": [],
         "signature": None,
+        **({"profiles": [_profile(p) for p in fit.profiles]} if fit.profiles else {}),
     }
+
+
+def _profile(profile: Profile) -> dict[str, Any]:
+    return {
+        "name": profile.name,
+        "unit": profile.unit,
+        "values": profile.values,
+        "deviance": profile.deviance,
+        "threshold": profile.threshold,
+        "ci95": profile.interval,
+        "closed": profile.closed,
+        "replays": profile.replays,
+    }
+
+
+def _of_posterior(posterior: Posterior) -> dict[str, Any]:
+    drawn, found = posterior.sample, posterior.sample.convergence
+    ensembles, steps, walkers, _ = drawn.draws.shape
+    parameters = []
+    for i, (entry, own, prior) in enumerate(
+        zip(_of_fit(posterior.as_fit)["parameters"], posterior.fit.estimates, posterior.priors, strict=True)
+    ):
+        parameters.append(
+            {
+                **entry,
+                "median": float(np.median(drawn.flat[:, i])),
+                "prior": str(prior),
+                "posterior_over_prior_std": float(posterior.learnt[i]),
+                "rhat": float(found.rhat[i]),
+                "autocorrelation_time": float(found.tau[i]),
+                "ess": float(found.ess[i]),
+                "least_squares": {"value": own.value, "std": own.std},
+            }
+        )
+    return {
+        **_of_fit(posterior.as_fit),
+        "kind": "posterior",
+        "message": posterior_message(posterior),
+        "converged": drawn.converged,
+        "termination": drawn.termination,
+        "parameters": parameters,
+        "sampling": {
+            "ensembles": ensembles,
+            "walkers": walkers,
+            "burn_in": found.burn_in,
+            "steps": steps,
+            "draws": ensembles * steps * walkers,
+            "autocorrelation_times": steps / float(np.max(found.tau)),
+            "rhat": float(np.max(found.rhat)),
+            "ess": float(np.min(found.ess)),
+            "replays": drawn.evaluations,
+        },
+        "surrogate": {
+            "method": "linearised residuals; every draw accepted by a real replay (surrogate transition)",
+            "acceptance": drawn.surrogate.acceptance,
+            "log_likelihood_error": drawn.surrogate.error,
+            "proposals": drawn.surrogate.proposals,
+        },
+        "likelihood": {
+            "method": "Gaussian, adjusted to the covariance of correlated residuals (Chandler and Bate 2007)",
+            "independent_share": posterior.likelihood.share,
+        },
+        "predictive": {channel: {"coverage95": share} for channel, share in posterior.coverage.items()},
+    }
+
+
+def posterior_message(posterior: Posterior) -> str:
+    """The outcome of a posterior in one sentence."""
+    told = sum(e.identifiable != "no" for e in posterior.estimates)
+    found = posterior.sample.convergence
+    parts = [
+        f"{told} of {len(posterior.estimates)} parameters can be told from this log",
+        f"{float(np.min(found.ess)):.0f} effective draws or more, R-hat {float(np.max(found.rhat)):.3f} or less",
+        *(
+            f"{100 * share:.1f} % of held-out {channel} lie in the 95 % bands"
+            for channel, share in posterior.coverage.items()
+        ),
+    ]
+    if not posterior.converged:
+        parts.append("the posterior did not converge")
+    return "; ".join(parts) + "."
 
 
 def _of_closing(closing: Closing) -> dict[str, Any]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TextIO
@@ -18,11 +20,14 @@ from sysid_btr.errors import UsageError
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
+    from sysid_btr.posterior.posterior import Posterior
 
 RESULT = "result.json"
 OVERLAY = "overlay.png"
 REPORT = "report.html"
 JOURNAL = "journal.jsonl"
+MODEL = "model.xml"
+PARAMS = "params.json"
 LINE_EVERY = 10.0
 """Seconds between progress lines where the terminal cannot redraw one."""
 
@@ -41,7 +46,7 @@ class Folder:
     @property
     def held(self) -> tuple[str, ...]:
         """Names of what an earlier run left here."""
-        return tuple(n for n in (RESULT, REPORT, OVERLAY, JOURNAL) if (self.path / n).exists())
+        return tuple(n for n in (RESULT, REPORT, OVERLAY, JOURNAL, MODEL, PARAMS) if (self.path / n).exists())
 
     def write(self, name: str, content: str | bytes) -> Path:
         """Write one file, all or nothing.
@@ -104,9 +109,10 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
 
 
 def save(
-    outcome: Fit | Closing, out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False
+    outcome: Fit | Closing | Posterior, out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False
 ) -> Path:
-    """Write result.json, overlay.png and report.html of a fit or a closing, as the command line does.
+    """Write result.json, model.xml, params.json, overlay.png and report.html of a fit or a closing, as the command
+    line does.
 
     Parameters
     ----------
@@ -126,18 +132,60 @@ def save(
     return write_all(folder, outcome, make_result(outcome, seed=seed))
 
 
-def write_all(folder: Folder, outcome: Fit | Closing, result: dict[str, Any]) -> Path:
-    """Write all files of a run; the result last, because its presence says that the run is complete."""
+def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[str, Any]) -> Path:
+    """Write all files of a run; the result last, because its presence says that the run is complete.
+
+    The result is given what the model became.
+    """
     from sysid_btr.report.figures import draw_overlay, trace_outcome
     from sysid_btr.report.html import render
     from sysid_btr.result import to_json
+    from sysid_btr.writeback.write import describe_model
 
+    for name, content in _pictures(outcome).items():
+        folder.write(name, content())
+    outcome = as_model(outcome)
+    describe_model(outcome, result, folder)
     traces = trace_outcome(outcome)
     light, dark = draw_overlay(traces), draw_overlay(traces, dark=True)
     folder.write(OVERLAY, light)
     report = folder.write(REPORT, render(result, light, dark))
     folder.write(RESULT, to_json(result))
     return report
+
+
+def as_model(outcome: Fit | Closing | Posterior) -> Fit | Closing:
+    """What stands for an outcome where one model is asked for: a posterior's means."""
+    from sysid_btr.posterior.posterior import Posterior
+
+    return outcome.as_fit if isinstance(outcome, Posterior) else outcome
+
+
+def _pictures(outcome: Fit | Closing | Posterior) -> dict[str, Callable[[], bytes]]:
+    """Files that only some outcomes have."""
+    from sysid_btr.identify.fit import Fit
+    from sysid_btr.posterior.posterior import Posterior
+
+    if isinstance(outcome, Posterior):
+        from sysid_btr.posterior.export import netcdf
+        from sysid_btr.report.posterior import bands_png, corner_png, trace_png
+
+        return {
+            "posterior.nc": partial(netcdf, outcome),
+            "corner.png": partial(corner_png, outcome),
+            "trace.png": partial(trace_png, outcome),
+            "predictive.png": partial(bands_png, outcome),
+        }
+    if isinstance(outcome, Fit) and outcome.profiles:
+        from sysid_btr.report.posterior import profile_png
+
+        return {f"profile_{file_name(p.name)}.png": partial(profile_png, p) for p in outcome.profiles}
+    return {}
+
+
+def file_name(parameter: str) -> str:
+    """A parameter's name as a part of a file's."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", parameter).strip("_")
 
 
 class Interrupted(BaseException):

@@ -31,7 +31,7 @@ from sysid_btr.testing import (
     run,
 )
 
-NAMES = ("lsq", "ga", "cmaes", *(f"nlopt:{algorithm}" for algorithm in ALGORITHMS))
+NAMES = ("lsq", "ga", "cmaes", "emcee", *(f"nlopt:{algorithm}" for algorithm in ALGORITHMS))
 
 
 @pytest.mark.parametrize("check", ESTIMATOR_CHECKS, ids=lambda check: check.__name__)
@@ -48,6 +48,7 @@ def test_conformance(name: str, check: Callable[[Estimator], None]) -> None:
         ("ga", {"population": 12, "elite": 3, "bits": 9, "mutation": 0.05}),
         ("cmaes", {"restarts": 2, "population": 8}),
         ("cmaes", {"separable": True}),
+        ("emcee", {"walkers": 12, "spread": 0.5}),
     ],
 )
 def test_conformance_with_settings(name: str, settings: dict[str, object]) -> None:

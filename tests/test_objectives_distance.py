@@ -8,11 +8,24 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import wasserstein_distance
 from toys import FINE, pendulum, position, swing
 
 from sysid_btr.errors import UsageError
+from sysid_btr.estimators import get_estimator
+from sysid_btr.identify.fit import fit
+from sysid_btr.identify.study import make_study
 from sysid_btr.models.grammar import parse_parameters
-from sysid_btr.objectives.distance import DistanceProblem, MeanSquare, Phi2, get_distance, information_distance, phi1
+from sysid_btr.objectives.distance import (
+    DistanceProblem,
+    MeanSquare,
+    Phi1,
+    Phi2,
+    Wasserstein,
+    get_distance,
+    information_distance,
+    phi1,
+)
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
@@ -72,7 +85,55 @@ def test_mean_square_and_phi1_closed_forms() -> None:
     assert phi1(np.array([1.0, 2.0]), np.array([[1.5, 2.5], [1.0, 0.0]])) == pytest.approx([0.5, 1.0])
 
 
-@pytest.mark.parametrize("name", ["mse", "phi2:15"])
+def test_wasserstein_is_that_of_scipy_joint_by_joint() -> None:
+    rng = np.random.default_rng(0)
+    measured = rng.standard_normal((200, 2))
+    predicted = rng.standard_normal((3, 200, 2)) * 1.3 + 0.2
+    mask = rng.random((200, 2)) < 0.9
+    floor = (NoiseFloor(1e-3, "high-frequency", 0.0),) * 2
+    both = Target("position", ("a", "b"), np.array([0, 1]), measured, floor, np.full(2, 1e-3), mask)
+    expected = [
+        sum(wasserstein_distance(measured[mask[:, k], k], row[mask[:, k], k]) for k in range(2)) for row in predicted
+    ]
+    assert Wasserstein()(both, predicted) == pytest.approx(expected)
+
+
+def test_wasserstein_sees_an_offset_and_a_gain_but_not_time() -> None:
+    t = np.arange(4000) * 0.01
+    moving = target(np.sin(t))
+    shown = [np.sin(t), np.sin(t) + 0.1, 0.8 * np.sin(t), np.sin(t)[::-1]]
+    same, offset, gain, reversed_ = Wasserstein()(moving, np.array(shown)[:, :, None])
+    assert same == 0
+    assert offset == pytest.approx(0.1)
+    assert gain == pytest.approx(0.2 * np.mean(np.abs(np.sin(t))), rel=0.01)
+    assert reversed_ == pytest.approx(0, abs=1e-12)
+    failed = np.full((1, 4000, 1), np.nan)
+    assert not np.isfinite(Wasserstein()(moving, failed)[0])
+
+
+def test_phi1_compares_the_fitness_of_motions() -> None:
+    t = np.arange(4000) * 0.01
+    moving = target(np.sin(t))
+    shown = np.array([np.sin(t), 0.8 * np.sin(t), np.full(4000, np.nan)])[:, :, None]
+    same, weaker, failed = Phi1()(moving, shown)
+    assert same == pytest.approx(0)
+    assert weaker == pytest.approx(0.2 * np.std(np.sin(t)))
+    assert not np.isfinite(failed)
+    farthest = Phi1(lambda motion: np.asarray(np.max(np.abs(motion), axis=1)))
+    assert farthest(moving, shown)[1] == pytest.approx(0.2, rel=1e-3)
+
+
+@pytest.mark.parametrize("estimator", ["lsq", "cmaes+lsq", "emcee"])
+@pytest.mark.parametrize("name", ["mse", "phi1", "phi2", "wasserstein"])
+def test_estimators_that_need_residuals_refuse_a_distance(estimator: str, name: str) -> None:
+    robot, log = pendulum(), swing(seconds=3.0)
+    recorded = replace(log, channels={**log.channels, "position.arm": position(robot, log)[:, 0]})
+    study = make_study(robot, [recorded], numerics=FINE)
+    with pytest.raises(UsageError, match=r"cmaes|residuals"):
+        fit(study, ["kp:arm"], estimator=get_estimator(estimator), distance=get_distance(name))
+
+
+@pytest.mark.parametrize("name", ["mse", "phi1", "phi2:15", "wasserstein"])
 def test_the_true_gain_is_nearest(name: str) -> None:
     robot, log = pendulum(), swing(seconds=6.0)
     modifiers = parse_parameters(["kp:arm"], robot)

@@ -12,7 +12,8 @@ import os
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,16 @@ class Record:
         )
 
 
+@dataclass
+class _Tape:
+    """What a journal and its sections share: the records, where replay stands, the latest attachment."""
+
+    records: list[Record] = field(default_factory=list)
+    cursor: int = 0
+    attachment: tuple[int, FloatArray] | None = None
+    last_sync: float = -np.inf
+
+
 class Journal:
     """Append-only record of evaluations, in memory or in a JSON-lines file.
 
@@ -90,29 +101,41 @@ class Journal:
     def __init__(self, path: str | os.PathLike[str] | None = None, *, fingerprint: str = "") -> None:
         self.path = None if path is None else Path(path)
         self.fingerprint = fingerprint
-        self._records: list[Record] = []
-        self._cursor = 0
-        self._attachment: tuple[int, FloatArray] | None = None
-        self._last_sync = -np.inf
+        self._tape = _Tape()
+        self._origin = 0
         if self.path is not None and self.path.exists():
             self._load(self.path)
 
     def __len__(self) -> int:
-        return len(self._records)
+        return len(self._tape.records)
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """All finished evaluations, in order."""
+        return tuple(self._tape.records)
 
     @property
     def evaluations(self) -> int:
         """Candidates recorded."""
-        return sum(len(record.candidates) for record in self._records)
+        return sum(len(record.candidates) for record in self._tape.records)
 
     @property
     def seconds(self) -> float:
         """Wall time of the fit up to the last record."""
-        return self._records[-1].seconds if self._records else 0.0
+        return self._tape.records[-1].seconds if self._tape.records else 0.0
 
     def rewind(self) -> None:
         """Replay from the first record on; a fit begins with this."""
-        self._cursor = 0
+        self._tape.cursor = self._origin
+
+    def section(self) -> Journal:
+        """The same journal for a search that follows another: its first record is the next one of this.
+
+        Records, position and file are shared, so one file holds, and resumes, several searches in a row.
+        """
+        rest = copy(self)
+        rest._origin = self._tape.cursor
+        return rest
 
     def replay(self, kind: str, candidates: FloatArray, *, whole: bool) -> Record | None:
         """The next record if one is left, else None.
@@ -125,40 +148,40 @@ class Journal:
         UsageError
             The record is of other candidates: the journal was written with other settings.
         """
-        if self._cursor == len(self._records):
+        if self._tape.cursor == len(self._tape.records):
             return None
-        record = self._records[self._cursor]
+        record = self._tape.records[self._tape.cursor]
         common = min(len(record.candidates), len(candidates))
         other_size = whole and len(record.candidates) != len(candidates)
         same = record.candidates[:common].tobytes() == candidates[:common].tobytes()
         if record.kind != kind or other_size or not same:
             raise UsageError(
-                f"{self._label}: record {self._cursor + 1} of {len(self._records)} was made for other "
+                f"{self._label}: record {self._tape.cursor + 1} of {len(self._tape.records)} was made for other "
                 "candidates than this fit asks for. The seed, the estimator's settings or a library version "
                 "differ from the run that wrote it: resume with the same ones, or begin anew with another "
                 "journal (--overwrite)"
             )
-        self._cursor += 1
+        self._tape.cursor += 1
         return record
 
     @property
     def position(self) -> int:
         """Number of records replayed or appended since the last rewind."""
-        return self._cursor
+        return self._tape.cursor
 
     def append(self, record: Record, attachment: FloatArray | None = None) -> None:
         """Add a finished evaluation. Only legal when nothing is left to replay."""
-        if self._cursor != len(self._records):
+        if self._tape.cursor != len(self._tape.records):
             raise ValueError("a journal is appended to only after its last record was replayed")
-        number = len(self._records)
+        number = len(self._tape.records)
         if attachment is not None:
             # Written before its record: a record on disk never lacks its attachment.
             self._save_attachment(number, attachment)
         self._write(record.to_line(), sync=attachment is not None)
         if attachment is not None:
             self._drop_older_attachments(number)
-        self._records.append(record)
-        self._cursor = len(self._records)
+        self._tape.records.append(record)
+        self._tape.cursor = len(self._tape.records)
 
     def attachment(self, number: int) -> FloatArray:
         """The attachment of record `number` (from 0), which must be the latest that has one.
@@ -168,8 +191,8 @@ class Journal:
         UsageError
             Its file is missing or damaged.
         """
-        if self._attachment is not None and self._attachment[0] == number:
-            return self._attachment[1]
+        if self._tape.attachment is not None and self._tape.attachment[0] == number:
+            return self._tape.attachment[1]
         try:
             if self.path is None:
                 raise FileNotFoundError("it was replaced by a later one")
@@ -190,7 +213,7 @@ class Journal:
         return path.with_name(f"{path.name}.{number}.npy")
 
     def _save_attachment(self, number: int, values: FloatArray) -> None:
-        self._attachment = (number, values)
+        self._tape.attachment = (number, values)
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -220,9 +243,9 @@ class Journal:
             line = json.dumps(header).encode() + b"\n" + line
         with self.path.open("ab", buffering=0) as file:
             file.write(line)
-            if sync or time.monotonic() - self._last_sync >= _SYNC_PERIOD:
+            if sync or time.monotonic() - self._tape.last_sync >= _SYNC_PERIOD:
                 os.fsync(file.fileno())
-                self._last_sync = time.monotonic()
+                self._tape.last_sync = time.monotonic()
 
     def _load(self, path: Path) -> None:
         data = path.read_bytes()
@@ -237,7 +260,7 @@ class Journal:
         good = len(whole[0]) + 1
         for i, line in enumerate(whole[1:], start=2):
             try:
-                self._records.append(Record.from_line(line))
+                self._tape.records.append(Record.from_line(line))
             except (ValueError, KeyError, TypeError, AttributeError):
                 if i == len(whole) and not tail:
                     break  # the last record, cut short and closed by blocks the disk never wrote

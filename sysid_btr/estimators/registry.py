@@ -8,8 +8,10 @@ from typing import Any
 
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Estimator
+from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.derivative_free import LOCAL, NLopt
+from sysid_btr.estimators.ensemble import Ensemble
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.lsq import LeastSquares
 
@@ -26,6 +28,7 @@ BUILT_IN: Mapping[str, Factory] = {
     "ga": GeneticAlgorithm,
     "cmaes": CmaEs,
     "nlopt": NLopt,
+    "emcee": Ensemble,
 }
 _WITH_ARGUMENT = {"nlopt": LOCAL[0]}
 
@@ -42,31 +45,45 @@ def get_estimator(name: str, **settings: Any) -> Estimator:
     Parameters
     ----------
     name
-        ``lsq``, ``ga``, ``cmaes``, ``nlopt:<algorithm>``, or one installed under the entry-point group
-        `ENTRY_POINTS`.
+        ``lsq``, ``ga``, ``cmaes``, ``nlopt:<algorithm>``, ``emcee``, or one installed under the entry-point
+        group `ENTRY_POINTS`; or several joined by ``+``, as in ``cmaes+lsq``: a `Chain`.
     settings
-        Fields of the estimator's class, for example ``max_iterations=5``.
+        Fields of the estimator's class, for example ``max_iterations=5``; of a chain, those of `Chain`.
 
     Raises
     ------
     UsageError
         No such estimator, no such setting, or a value the estimator refuses.
     """
+    if "+" in name:
+        return _chain(name, settings)
     stem, colon, argument = name.partition(":")
     factory = BUILT_IN.get(stem) or _load(stem)
     if factory is None:
         raise UsageError(_unknown(name))
     if colon and stem in BUILT_IN and stem not in _WITH_ARGUMENT:
         raise UsageError(f"estimator {stem!r} takes nothing after a colon: write {stem!r}, not {name!r}")
-    if is_dataclass(factory):
-        known = [field.name for field in fields(factory)]
-        wrong = [key for key in settings if key not in known]
-        if wrong:
-            raise UsageError(
-                f"estimator {stem!r} has no setting {', '.join(wrong)}; it has {', '.join(known)}"
-            )
+    _check_settings(stem, factory, settings)
     estimator: Estimator = factory(argument, **settings) if colon else factory(**settings)
     return estimator
+
+
+def _chain(name: str, settings: Mapping[str, Any]) -> Estimator:
+    stems = name.split("+")
+    if not all(stems):
+        raise UsageError(f"{name!r} is no chain of estimators: join their names, as in 'cmaes+lsq'")
+    wanted = {key: value for key, value in settings.items() if key != "stages"}
+    _check_settings(name, Chain, wanted)
+    return Chain(tuple(get_estimator(stem) for stem in stems), **wanted)
+
+
+def _check_settings(name: str, factory: Factory, settings: Mapping[str, Any]) -> None:
+    if not is_dataclass(factory):
+        return
+    known = [field.name for field in fields(factory)]
+    wrong = [key for key in settings if key not in known]
+    if wrong:
+        raise UsageError(f"estimator {name!r} has no setting {', '.join(wrong)}; it has {', '.join(known)}")
 
 
 def _installed() -> dict[str, Any]:
@@ -94,4 +111,4 @@ def _unknown(name: str) -> str:
     names = available()
     close = get_close_matches(name.lower(), names, n=2, cutoff=0.5)
     hint = f" Did you mean {' or '.join(repr(c) for c in close)}?" if close else ""
-    return f"there is no estimator {name!r}.{hint} There are {', '.join(names)}"
+    return f"there is no estimator {name!r}.{hint} There are {', '.join(names)}, and chains such as cmaes+lsq"

@@ -60,12 +60,24 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield Text("what is left: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
     if result.get("converged") is False:
         yield Text(result["termination"], style="bold")
+    for walk in result.get("walks", []):
+        if walk["part"] == "train":
+            yield Text("; ".join(walk_words(walk)), style="dim")
     numerics, model = result["numerics"], result["model"]["name"]
     yield Text(
         f"model {model}, {numerics['chosen']}; {result['replays']} replays in {result['wall_s']:.1f} s"
         + (f"; seed {result['seed']}" if result.get("seed") is not None else ""),
         style="dim",
     )
+
+
+def walk_words(walk: Mapping[str, Any]) -> Iterator[str]:
+    """What was done with a log of a free base."""
+    yield f"free base: {walk['windows']} windows of {walk['window']:.2g} s fitted, each from a reconstructed state"
+    if walk["counted_less"]:
+        yield f"{walk['counted_less']} of them, mostly impacts, count less"
+    yield from walk["events"]
+    yield from walk["lost"]
 
 
 def stages(result: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -75,6 +87,7 @@ def stages(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         "fit": [("nominal", "plain model"), ("before", "fitted")],
         "posterior": [("nominal", "plain model"), ("before", "posterior mean")],
         "close": [("nominal", "plain model"), ("before", "parameters fitted"), ("after", "effects added")],
+        "btr": [("nominal", "plain model"), ("after", "corrected by the trials")],
     }
     return names[result["kind"]]
 

@@ -69,7 +69,7 @@ def read_params(path: Path, robot: Robot) -> Params:
     try:
         places = _places(robot)
         for entry in content["modifiers"]:
-            modifier = _modifier(entry, places, problems)
+            modifier = _modifier(entry, places, problems, robot)
             if modifier is not None:
                 modifiers.append(modifier)
                 values += [float(p["value"]) for p in entry["parameters"]]
@@ -94,13 +94,15 @@ def _places(robot: Robot) -> Mapping[str, Sequence[str]]:
     }
 
 
-def _modifier(entry: Mapping[str, Any], places: Mapping[str, Sequence[str]], problems: list[str]) -> Modifier | None:
+def _modifier(
+    entry: Mapping[str, Any], places: Mapping[str, Sequence[str]], problems: list[str], robot: Robot
+) -> Modifier | None:
     from sysid_btr.effects.library import EFFECTS
     from sysid_btr.models.fields import FIELDS
 
     name, variant, where = str(entry["name"]), str(entry["variant"]), tuple(entry["where"])
     if entry["kind"] == "parameter":
-        found: Any = FIELDS.get(name)
+        found: Any = {**FIELDS, **robot.fields}.get(name)
     else:
         found = next((e for e in EFFECTS if (e.name, e.variant) == (name, variant)), None)
     if found is None:

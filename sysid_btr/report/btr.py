@@ -1,0 +1,119 @@
+"""The paper's Fig. 3: fitness, its difference, and the model's parameters over the iterations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid_btr.report.figures import DARK, LIGHT, MODEL_COLOURS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLUMNS = 3
+SHOWN = 30
+"""Models drawn of each iteration, best last and darkest."""
+
+
+def draw_btr(result: Mapping[str, Any], *, dark: bool = False, truth: Mapping[str, float] | None = None) -> bytes:
+    """PNG of a result of kind ``btr``.
+
+    Parameters
+    ----------
+    result : content of result.json.
+    dark : for a dark page.
+    truth : parameter -> value in the robot, where it is known.
+    """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    theme = DARK if dark else LIGHT
+    rounds = result["iterations"]
+    names = list(dict.fromkeys(n for r in rounds for n in r["model"]))
+    style: Any = {
+        "font.size": 9,
+        "text.color": theme["ink"],
+        "axes.labelcolor": theme["ink"],
+        "axes.edgecolor": theme["faint"],
+        "axes.facecolor": theme["paper"],
+        "xtick.color": theme["faint"],
+        "ytick.color": theme["faint"],
+        "xtick.labelcolor": theme["ink"],
+        "ytick.labelcolor": theme["ink"],
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+    }
+    count = 2 + len(names)
+    rows = -(-count // COLUMNS)
+    with rc_context(style):
+        figure = Figure(figsize=(13, 0.4 + 2.8 * rows), layout="constrained", facecolor=theme["paper"])
+        FigureCanvasAgg(figure)
+        axes = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
+        _fitness(axes[0], result, theme)
+        _difference(axes[1], rounds)
+        for axis, name in zip(axes[2:], names, strict=False):
+            _parameter(axis, rounds, name, theme, (truth or {}).get(name))
+        for axis in axes[:count]:
+            axis.set_xlabel("iteration")
+            axis.locator_params(axis="x", integer=True)
+        for axis in axes[count:]:
+            axis.set_visible(False)
+        buffer = BytesIO()
+        figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _numbers(values: Sequence[float | None]) -> list[float]:
+    return [np.nan if v is None else v for v in values]
+
+
+def _fitness(axis: Axes, result: Mapping[str, Any], theme: Mapping[str, str]) -> None:
+    rounds = result["iterations"]
+    x = [r["number"] for r in rounds]
+    at = [t["iteration"] for t in result["trials"]]
+    axis.scatter(at, _numbers([t["fitness"] for t in result["trials"]]), s=8, color=theme["faint"], label="trials")
+    for key, label, colour, line in (
+        ("best", "best on the robot", MODEL_COLOURS[2], "-"),
+        ("mean", "mean on the robot", MODEL_COLOURS[2], ":"),
+        ("expected", "best in the model", MODEL_COLOURS[0], "--"),
+    ):
+        axis.plot(x, _numbers([r["fitness"][key] for r in rounds]), line, color=colour, label=label)
+    axis.set_ylabel(f"fitness ({result['units']['fitness']})")
+    axis.legend(fontsize=7)
+
+
+def _difference(axis: Axes, rounds: Sequence[Mapping[str, Any]]) -> None:
+    x = [r["number"] for r in rounds]
+    for key, label, colour, line in (
+        ("transfer", "foreseen", MODEL_COLOURS[0], "--"),
+        ("corrected", "after correction", MODEL_COLOURS[2], "-"),
+    ):
+        axis.plot(x, _numbers([r["delta_fitness"][key] for r in rounds]), line, color=colour, label=label)
+    axis.set_ylabel("mean |model - robot| (m/s)")
+    if any(v is not None and v > 0 for r in rounds for v in r["delta_fitness"].values()):
+        axis.set_yscale("log")
+    axis.legend(fontsize=7)
+
+
+def _parameter(
+    axis: Axes, rounds: Sequence[Mapping[str, Any]], name: str, theme: Mapping[str, str], truth: float | None
+) -> None:
+    for r in rounds:
+        names, values = list(r["models"]["names"]), np.array(r["models"]["values"], dtype=np.float64)
+        if name not in names or not len(values):
+            continue
+        losses = np.array(_numbers(r["models"]["losses"]))
+        order = np.argsort(-np.nan_to_num(losses, nan=np.inf), kind="stable")[-SHOWN:]
+        shade = np.linspace(0.05, 0.5, len(order))
+        place = np.full(len(order), float(r["number"]))
+        axis.scatter(place, values[order, names.index(name)], s=10, color=theme["faint"], alpha=shade.tolist(), lw=0)
+    x = [r["number"] for r in rounds if name in r["model"]]
+    axis.plot(x, [r["model"][name] for r in rounds if name in r["model"]], color=theme["ink"])
+    if truth is not None:
+        axis.axhline(truth, color=MODEL_COLOURS[0], lw=0.8, ls="--")
+    axis.set_ylabel(name)
