@@ -192,6 +192,25 @@ def test_candidates_that_fail_are_never_drawn() -> None:
     assert np.all(np.isfinite(toy.loss(found.flat)))
 
 
+def test_a_better_minimum_than_the_fits_is_found_and_told() -> None:
+    toy = ToyProblem(
+        ("x",),
+        np.array([-2.0]),
+        np.array([2.0]),
+        np.array([-0.9]),
+        lambda x: np.stack([4.0 * (x[:, 0] ** 2 - 1.0), 1.5 * (x[:, 0] - 1.0)], axis=1),
+        np.array([1.0]),
+    )
+    worse = LeastSquares().fit(
+        toy, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
+    )
+    assert worse.x[0] < 0
+    found = draw(toy, plain(toy, worse.x), draws=500.0, budget=Budget(evaluations=6000))
+    assert found.gain == pytest.approx(0.5 * worse.loss, rel=0.05)
+    assert np.mean(found.flat > 0) > 0.8
+    assert draw(toy, draws=300.0, budget=Budget(evaluations=6000)).gain <= 1e-9
+
+
 # --- calibration ------------------------------------------------------------------------------------------
 
 DATASETS, THINNED, BINS = 96, 31, 8

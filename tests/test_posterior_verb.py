@@ -20,7 +20,7 @@ from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.robot import load_robot
 from sysid_btr.optional import optional
-from sysid_btr.posterior.posterior import Posterior, posterior
+from sysid_btr.posterior.draw import Posterior, posterior
 from sysid_btr.posterior.sampling import Settings
 from sysid_btr.result import read_result
 

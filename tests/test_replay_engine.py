@@ -230,8 +230,9 @@ def test_memory_does_not_grow_with_the_number_of_candidates() -> None:
         tracemalloc.stop()
         return used
 
-    peak(32)
-    few, many = peak(32), peak(256)
+    chunk = engine.CHUNK_DOFS // len(LEG_JOINTS)
+    peak(chunk)
+    few, many = peak(chunk), peak(8 * chunk)
     assert many < 1.5 * few + 1e6
 
 
