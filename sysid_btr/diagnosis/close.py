@@ -41,7 +41,8 @@ SCAN_SECONDS = 15.0
 """Part of each log that is scanned; the leading hypotheses are refitted on more."""
 REFIT_SECONDS = 20.0
 LADDER_SECONDS = 6.0
-"""Part of each log on which it is decided where a refit begins."""
+"""Part of each log on which it is decided where a refit begins, if there are more than ..."""
+FEW_STARTS = 12
 MAX_ROUNDS = 6
 MAX_REFINEMENTS = 1
 """Times the step may be halved in the end."""
@@ -291,7 +292,8 @@ def _try(
     rest = state.fitted.values if values is None else values
     ladder = hypothesis.ladder()
     starts = np.column_stack([np.tile(rest, (len(ladder), 1)), ladder])
-    start = best_start(shorten(study, LADDER_SECONDS), modifiers, starts)
+    seconds = REFIT_SECONDS if len(starts) <= FEW_STARTS else LADDER_SECONDS
+    start = best_start(shorten(study, seconds), modifiers, starts)
     found = refit(shorten(study, REFIT_SECONDS), modifiers, start)
     return judge(study, modifiers, found.values, found.evaluations + len(starts))
 

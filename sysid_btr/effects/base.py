@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 LADDER = (0.3, 0.55, 1.0, 1.8, 3.0, 5.0)
 """Multiples of the scan's amount at which a refit may begin."""
 
+THRESHOLDS = (0.6, 0.72, 0.85, 1.0, 1.15, 1.3, 1.5)
+"""The same for a limit, which does nothing a little too high."""
+
 Probe = tuple[tuple[float, ...], ...]
 """Values (one tuple a direction) whose responses span an effect linearly at one working point."""
 
@@ -121,11 +124,11 @@ class Effect(Modifier):
         """
         if cls.signed:
             return values[None]
-        nominal = np.array([k.nominal for k in cls.kinds])
-        result = np.tile(values, (len(LADDER), 1))
-        fixed = cls.kinds[cls.main].name in cls.held
-        anchor = 0.0 if fixed else nominal[cls.main]
-        result[:, cls.main] = anchor + np.array(LADDER) * (values[cls.main] - anchor)
+        threshold = cls.kinds[cls.main].name in cls.held
+        rungs = np.array(THRESHOLDS if threshold else LADDER)
+        anchor = 0.0 if threshold else cls.kinds[cls.main].nominal
+        result = np.tile(values, (len(rungs), 1))
+        result[:, cls.main] = anchor + rungs * (values[cls.main] - anchor)
         return result
 
     @property

@@ -17,6 +17,8 @@ from sysid_btr.objectives.problem import ReplayProblem
 
 CORRELATED = 1.5
 """Chi2 of a column beyond which its residual is an error of the model rather than noise."""
+NOTICEABLE = 0.99
+"""Fraction of a loss that another start must reach."""
 CLEAN = 1.02
 """Chi2 of a column below which it counts as explained."""
 
@@ -88,12 +90,13 @@ def refit(
 
 
 def best_start(study: Study, modifiers: tuple[Modifier, ...], starts: FloatArray) -> FloatArray:
-    """The best (p,) of several first guesses (k, p), of which the first wins a tie."""
+    """The best (p,) of several first guesses (k, p); the first, unless another one is better by more than a trace."""
     starts = np.clip(starts, *_bounds(modifiers))
     if len(starts) == 1:
         return np.asarray(starts[0])
-    losses = study.train_problem(modifiers, starts[0]).loss(starts)
-    return np.asarray(starts[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))])
+    losses = np.nan_to_num(study.train_problem(modifiers, starts[0]).loss(starts), nan=np.inf)
+    best = int(np.argmin(losses))
+    return np.asarray(starts[best if losses[best] < NOTICEABLE * losses[0] else 0])
 
 
 MOST_WALKED = 8.0
