@@ -1,0 +1,213 @@
+"""A designed motion for users: files, result.json, table and figure."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid_btr.estimators.base import Termination
+from sysid_btr.result import SCHEMA, clean, estimate_entry, model_entry, to_json, versions
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from sysid_btr.excite.design import Design
+    from sysid_btr.identify.intervals import Estimate
+    from sysid_btr.session import Folder
+
+MOTION, FIGURE = "excite.parquet", "excite.png"
+MOTORS_SHOWN = 6
+WARNING = (
+    "Only the limits of the joints keep this motion from hitting the robot itself or the ground: replay it in a viewer "
+    "first, and play it on the robot slowly at first."
+)
+
+
+@contextmanager
+def first_interrupt_ends_the_search() -> Iterator[None]:
+    """Ctrl-C ends a search, which then gives its best, and not the run."""
+    try:
+        previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    except ValueError:  # not in the main thread, which alone hears signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def interrupted(design: Design) -> bool:
+    """Whether the search was stopped before its end."""
+    return design.result.termination is Termination.INTERRUPTED
+
+
+def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
+    """The content of result.json: kind ``excite``.
+
+    A parameter's ``value`` is its nominal one; ``std`` and ``ci95`` are what a fit of a log of the motion to this
+    model is expected to give, ``reference`` has the same of the reference motion.
+    """
+    after, before = design.designed.estimates, design.reference.estimates
+    family, clock = design.family, design.family.clock
+    commands = family.commands(design.coefficients)[1]
+    step = 1 / clock.rate
+    floors: dict[str, list[float]] = {}
+    for (channel, _), sigma in design.experiment.sensors.floor.items():
+        floors.setdefault(channel, []).append(sigma)
+    plain: dict[str, Any] = clean(
+        {
+            "schema": SCHEMA,
+            "kind": "excite",
+            "message": message(design),
+            "termination": design.result.termination.value,
+            "parameters": [
+                {**estimate_entry(a), "reference": _told(b), "ratio": float(ratio) if told else None}
+                for a, b, ratio, told in zip(after, before, design.ratios, design.told, strict=True)
+            ],
+            "effects": [],
+            "mean_ratio": design.mean_ratio,
+            "reference": {"motion": design.compared_with, "seconds": design.reference.seconds},
+            "motion": {
+                "file": MOTION,
+                "seconds": clock.seconds,
+                "rate": clock.rate,
+                "repeats_after": clock.period,
+                "frequencies": clock.frequencies,
+                "motors": [
+                    {
+                        "joints": list(m.joints),
+                        "position": {"limits": [m.low, m.high], "used": [float(q.min()), float(q.max())]},
+                        "velocity": {"limit": m.velocity, "used": float(np.abs(np.diff(q)).max() / step)},
+                        "acceleration": {
+                            "limit": m.acceleration,
+                            "used": float(np.abs(np.diff(q, 2)).max() / step**2),
+                        },
+                    }
+                    for m, q in zip(family.motors, commands.T, strict=True)
+                ],
+                "predicted_beyond_range": dict(design.beyond),
+                "warning": WARNING,
+            },
+            "noise_floor": {channel: float(np.median(values)) for channel, values in floors.items()},
+            "noise_floor_source": design.experiment.sensors.source,
+            "numerics": {"chosen": str(design.experiment.numerics)},
+            "versions": versions(),
+            "model": model_entry(design.experiment.robot),
+            "seed": seed,
+            "motions_tried": design.result.evaluations,
+            "wall_s": design.seconds,
+        }
+    )
+    return plain
+
+
+def _told(estimate: Estimate) -> dict[str, Any]:
+    entry = estimate_entry(estimate)
+    return {key: entry[key] for key in ("std", "ci95", "identifiable", "reason")}
+
+
+def message(design: Design) -> str:
+    """The outcome in one sentence."""
+    count = sum(e.identifiable != "no" for e in design.designed.estimates)
+    parts = [
+        f"{count} of {len(design.designed.estimates)} parameters can be told after this motion of "
+        f"{design.family.clock.seconds:g} s",
+    ]
+    if any(design.told):
+        parts.append(
+            f"in the mean their intervals are {design.mean_ratio:.2f} of those after {design.compared_with} "
+            f"({design.reference.seconds:.3g} s)"
+        )
+    if design.beyond:
+        worst = max(design.beyond, key=lambda joint: design.beyond[joint])
+        parts.append(f"in the model {worst} leaves its range by {design.beyond[worst]:.2g}")
+    return "; ".join(parts) + "."
+
+
+def show(result: Mapping[str, Any]) -> Iterator[RenderableType]:
+    """The result for a terminal."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    from sysid_btr.report.text import number, told
+
+    yield Text(result["message"], style="bold")
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold")
+    table.add_column("parameter", overflow="fold")
+    for name in ("nominal", f"std, {result['reference']['motion']}", "std, designed", "95 % interval +-", "ratio"):
+        table.add_column(name, justify="right")
+    table.add_column("unit")
+    table.add_column("told")
+    for p in result["parameters"]:
+        known, before = p["identifiable"] != "no", p["reference"]
+        table.add_row(
+            p["name"],
+            number(p["nominal"]),
+            number(before["std"], 2) if before["identifiable"] != "no" else "-",
+            number(p["std"], 2) if known else "-",
+            number(0.5 * (p["ci95"][1] - p["ci95"][0]), 2) if known else "-",
+            number(p["ratio"], 2),
+            "x nominal" if p["unit"] == "1" else p["unit"],
+            told(p),
+        )
+    yield table
+    for p in result["parameters"]:
+        if p["reason"]:
+            yield Text(f"  {p['name']}: {told(p)}: {p['reason'].replace('this log', 'this motion')}")
+    floors = ", ".join(f"{channel} {value:.3g}" for channel, value in result["noise_floor"].items())
+    yield Text(f"noise floor {result['noise_floor_source']}: {floors} (SI, median over joints)", style="dim")
+    yield Text(
+        f"{result['motions_tried']} motions tried in {result['wall_s']:.1f} s; seed {result['seed']}; "
+        f"{result['numerics']['chosen']}",
+        style="dim",
+    )
+
+
+def draw(design: Design) -> bytes:
+    """PNG: the commands of the motors that move most, and the ratio of every interval to the reference's."""
+    from sysid_btr.report.posterior import FAINT, FITTED, INK, MODEL, new_figure, png
+
+    time, commands = design.family.commands(design.coefficients)
+    motors = design.family.motors
+    order = np.argsort([-np.ptp(q) for q in commands.T], kind="stable")[:MOTORS_SHOWN]
+    names = [e.name for e in design.designed.estimates]
+    figure = new_figure(13, max(1.1 * len(order), 0.3 * len(names)) + 1.2)
+    halves: Any = figure.subfigures(1, 2, width_ratios=(1.5, 1))
+    left, right = halves
+    rows = left.subplots(len(order), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, i in zip(rows, order, strict=True):
+        axis.plot(time, commands[:, i], color=INK, lw=1)
+        for bound in (motors[i].low, motors[i].high):
+            axis.axhline(bound, color=FAINT, lw=0.8, ls="--")
+        axis.set_ylabel(motors[i].joints[0], rotation=0, ha="right", fontsize=8)
+        axis.locator_params(axis="y", nbins=4)
+    rows[0].set_title("commands (rad, m) and their bounds", fontsize=9)
+    rows[-1].set_xlabel("time (s)")
+    axis = right.subplots()
+    place = np.arange(len(names))[::-1]
+    ratios = np.where(design.told, design.ratios, np.nan)
+    axis.barh(place, ratios, color=[MODEL if r <= 1 else FITTED for r in np.nan_to_num(ratios)])
+    for y, ratio in zip(place, ratios, strict=True):
+        text = f" {ratio:.2f}" if np.isfinite(ratio) else " told by neither"
+        axis.text(ratio if np.isfinite(ratio) else 0.0, y, text, va="center", fontsize=8, color=INK)
+    axis.axvline(1.0, color=FAINT, lw=0.8)
+    axis.set_yticks(place, names, fontsize=8)
+    axis.set_xlim(0, 1.15 * max(np.nanmax(ratios, initial=1.0), 1.0))
+    axis.set_title(f"standard error over that of {design.compared_with}", fontsize=9)
+    return png(figure)
+
+
+def write_all(folder: Folder, design: Design, result: Mapping[str, Any]) -> None:
+    """Write motion, figure and result; the result last, because its presence says that the run is complete."""
+    from sysid_btr.io.parquet import write_log
+    from sysid_btr.session import RESULT
+
+    write_log(design.log, folder.path / MOTION, overwrite=True)
+    folder.write(FIGURE, draw(design))
+    folder.write(RESULT, to_json(result))
