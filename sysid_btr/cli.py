@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
     from sysid_btr.models.modifier import Modifier
     from sysid_btr.models.robot import Robot
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
 
     Job = Callable[[Study, ProgressLine], Fit | Closing | Posterior]
 
@@ -586,9 +586,9 @@ def posterior(
     """
     from sysid_btr.estimators.base import Budget
     from sysid_btr.estimators.ensemble import walkers_for
+    from sysid_btr.posterior.draw import BUDGET
+    from sysid_btr.posterior.draw import posterior as draw_posterior
     from sysid_btr.posterior.export import check_installed
-    from sysid_btr.posterior.posterior import BUDGET
-    from sysid_btr.posterior.posterior import posterior as draw_posterior
     from sysid_btr.posterior.priors import choose_priors
     from sysid_btr.posterior.sampling import Settings
 
@@ -724,7 +724,9 @@ def btr(
         int | None,
         typer.Option("--trials", min=1, help="Trials on the robot in each iteration. [default: 12; 2 without phi1]"),
     ] = None,
-    duration: Annotated[float, typer.Option("--duration", metavar="S", help="Of a trial.")] = 3.0,
+    duration: Annotated[
+        float | None, typer.Option("--duration", metavar="S", help="Of a trial. [default: 3 for the ant, else 8]")
+    ] = None,
     distance: Annotated[
         str,
         typer.Option(

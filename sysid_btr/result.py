@@ -27,9 +27,11 @@ if TYPE_CHECKING:
     from sysid_btr.identify.scores import ChannelScore, Scores
     from sysid_btr.identify.study import Study
     from sysid_btr.models.robot import Robot
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
 
 SCHEMA = "sysid_btr.result/1"
+NOTICEABLE_GAIN = 2.0
+"""Log-likelihood of a draw over the fit's beyond which the fit was not the minimum."""
 CHANNEL_UNITS = {
     "position": ("rad", "m"),
     "velocity": ("rad/s", "m/s"),
@@ -54,7 +56,7 @@ def make_result(outcome: Fit | Closing | Posterior, *, seed: int = 0, wall_s: fl
         ``before``.
     """
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
 
     if isinstance(outcome, Posterior):
         found = _of_posterior(outcome)
@@ -185,6 +187,7 @@ def _of_posterior(posterior: Posterior) -> dict[str, Any]:
             "burn_in": found.burn_in,
             "steps": steps,
             "draws": ensembles * steps * walkers,
+            "log_likelihood_gain": drawn.gain,
             "autocorrelation_times": steps / float(np.max(found.tau)),
             "rhat": float(np.max(found.rhat)),
             "ess": float(np.min(found.ess)),
@@ -216,6 +219,13 @@ def posterior_message(posterior: Posterior) -> str:
             for channel, share in posterior.coverage.items()
         ),
     ]
+    if posterior.sample.gain > NOTICEABLE_GAIN:
+        best = posterior.sample.flat[int(np.argmax(posterior.sample.log_likelihood))]
+        start = " ".join(f"--start '{n}={v:.6g}'" for n, v in zip(posterior.sample.names, best, strict=True))
+        parts.append(
+            f"a draw is more likely than the fit by exp({posterior.sample.gain:.1f}), so the fit had missed the "
+            f"minimum: begin again with {start}"
+        )
     if not posterior.converged:
         parts.append("the posterior did not converge")
     return "; ".join(parts) + "."

@@ -20,7 +20,7 @@ from sysid_btr.errors import UsageError
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
 
 RESULT = "result.json"
 OVERLAY = "overlay.png"
@@ -156,7 +156,7 @@ def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[s
 
 def as_model(outcome: Fit | Closing | Posterior) -> Fit | Closing:
     """What stands for an outcome where one model is asked for: a posterior's means."""
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
 
     return outcome.as_fit if isinstance(outcome, Posterior) else outcome
 
@@ -164,7 +164,7 @@ def as_model(outcome: Fit | Closing | Posterior) -> Fit | Closing:
 def _pictures(outcome: Fit | Closing | Posterior) -> dict[str, Callable[[], bytes]]:
     """Files that only some outcomes have."""
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
 
     if isinstance(outcome, Posterior):
         from sysid_btr.posterior.export import netcdf

@@ -331,7 +331,7 @@ def test_study_file_knows_every_option_of_every_verb() -> None:
     command = typer.main.get_command(app)
     options = {
         option.removeprefix("--").replace("-", "_")
-        for verb in ("replay", "fit", "posterior", "close")
+        for verb in ("replay", "fit", "posterior", "close", "btr", "excite")
         for parameter in command.commands[verb].params
         for option in parameter.opts
         if option.startswith("--")

@@ -18,8 +18,10 @@ from sysid_btr.estimators.base import (
     require_residuals,
     silent,
 )
+from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.derivative_free import NLopt
+from sysid_btr.estimators.ensemble import Ensemble
 from sysid_btr.estimators.evaluator import Evaluator, Outcome, Reduced, Stop, drive
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.journal import Journal, Record
@@ -28,7 +30,9 @@ from sysid_btr.estimators.registry import available, get_estimator
 
 __all__ = [
     "Budget",
+    "Chain",
     "CmaEs",
+    "Ensemble",
     "Estimator",
     "Evaluator",
     "FitResult",

@@ -21,6 +21,7 @@ from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, sile
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import RANK, covariance
+from sysid_btr.identify.refit import walking
 from sysid_btr.objectives.problem import Conditional
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = s
         problem.blocks,
         index,
         points,
+        estimator=walking(LeastSquares()) if fit.study.free else LeastSquares(),
         shift=float(fit.numerics_shift[index]),
         unit=parameters[index].unit,
         progress=progress,
@@ -124,6 +126,7 @@ def profile_curve(
     index: int,
     points: int = POINTS,
     *,
+    estimator: LeastSquares | None = None,
     shift: float = 0.0,
     unit: str = "1",
     progress: Progress = silent,
@@ -135,13 +138,15 @@ def profile_curve(
     problem : with residuals.
     blocks : (r,) stretch of time of each residual, as for `covariance`.
     points : across the interval.
+    estimator : of the others' values; default least squares as they come.
     shift : change of the parameter when the replay's step is halved; widens the interval.
     """
     from scipy.stats import t as student
 
     if points < 5:
         raise UsageError(f"a profile needs at least 5 points, not {points}")
-    top = _fit(LeastSquares(), problem, progress)
+    estimator = LeastSquares() if estimator is None else estimator
+    top = _fit(estimator, problem, progress)
     jacobian, residual = top.jacobian, top.residual
     if jacobian is None or residual is None:
         raise UsageError("there is no profile where least squares do not settle: fit the parameters first")
@@ -159,8 +164,9 @@ def profile_curve(
     threshold = float(student.ppf(0.975, dof)) ** 2
     step = np.sqrt(BEYOND * threshold) * min(std, span) / (points // 2) if known else span / (points - 1)
     follow = _responses(normal, index)
-    low = list(_side(problem, top.x, top.loss, index, -step, follow, share, threshold, points, progress))
-    high = list(_side(problem, top.x, top.loss, index, step, follow, share, threshold, points, progress))
+    quick = replace(estimator, confirm=False, max_iterations=_ITERATIONS, tolerance=1e-5)
+    low = list(_side(problem, quick, top.x, top.loss, index, -step, follow, share, threshold, points, progress))
+    high = list(_side(problem, quick, top.x, top.loss, index, step, follow, share, threshold, points, progress))
     rows = [*reversed(low), (top.x, top.loss, top.evaluations), *high]
     others = np.array([x for x, _, _ in rows])
     loss = np.array([value for _, value, _ in rows])
@@ -191,6 +197,7 @@ Row = tuple[FloatArray, float, int]
 
 def _side(
     problem: ResidualProblem,
+    quick: LeastSquares,
     x: FloatArray,
     best: float,
     index: int,
@@ -215,7 +222,7 @@ def _side(
         begin[index] = value
         if free.any():
             held = Conditional(problem, free, begin)  # type: ignore[arg-type]
-            found = _fit(LeastSquares(confirm=False, max_iterations=_ITERATIONS, tolerance=1e-5), held, progress)
+            found = _fit(quick, held, progress)
             last, loss, spent = held.complete(found.x[None])[0], found.loss, found.evaluations
         else:
             last, loss, spent = begin, float(problem.loss(begin[None])[0]), 1

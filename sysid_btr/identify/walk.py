@@ -55,9 +55,11 @@ class Walk(Log):
         """Samples `start` to `stop` (exclusive), with the windows that lie within."""
         bare = Log.window(self, start, stop)
         assert isinstance(bare, Walk)
-        if self.base is None or self.windows is None:
+        if self.base is None:
             return bare
         stop = min(stop, len(self))
+        if self.windows is None:
+            return replace(bare, base=self.base.rows(start, stop))
         inside = np.flatnonzero((self.windows.rows[:, 0] >= start) & (self.windows.rows[:, 1] <= stop))
         marginal = None if self.marginal is None else self.marginal.chosen(inside).shifted(start)
         return replace(

@@ -66,6 +66,7 @@ class Index:
     joints : joint names in the order of the outputs, (nj,).
     qpos, dof, actuator, body : their addresses, (nj,); actuator is -1 for a joint without a servo.
     link_qpos, link_dof : addresses of a second, play or compliance joint on the link side, -1 where none.
+    base : addresses in qpos and qvel of a free base that is to be recorded, None where it is not.
     """
 
     joints: tuple[str, ...]
@@ -75,6 +76,7 @@ class Index:
     body: IntArray
     link_qpos: IntArray
     link_dof: IntArray
+    base: tuple[int, int] | None = None
 
     def of(self, names: Sequence[str]) -> IntArray:
         """Positions of joint names in the outputs."""
@@ -128,12 +130,17 @@ class Step:
 
 @dataclass
 class Outputs:
-    """Predicted sensors at the log's sample times; arrays are (candidates, samples, joints of the log)."""
+    """Predicted sensors at the log's sample times; arrays are (candidates, samples, joints of the log).
+
+    `base`, where it is recorded, is (candidates, samples, 13): position, quaternion, velocity, angular velocity of
+    the free base as MuJoCo has them, at the step border before each sample.
+    """
 
     time: FloatArray
     position: FloatArray
     velocity: FloatArray
     effort: FloatArray | None
+    base: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from sysid_btr import __version__
 from sysid_btr.optional import optional
 
 if TYPE_CHECKING:
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
 
 SCHEMA = "sysid_btr.posterior/1"
 

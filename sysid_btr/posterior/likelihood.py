@@ -10,7 +10,8 @@ a posterior: Ribatet, Cooley, Davison 2012, doi:10.5705/ss.2009.248):
 with the loss of a real replay at ``x``, the fit ``x0``, ``H = J'J`` and ``G`` the inverse of the sandwich covariance.
 In each direction the loss counts as much as the independent information in it, never more than white noise of the
 size that is left would allow. Where residuals are white and of the size of the noise floor ``k`` is 1; where the
-model is linear the posterior's covariance is the sandwich.
+model is linear the posterior's covariance is the sandwich. (The intervals of `fit` are a few per cent wider than the
+quantiles of such draws: by Student's t they also count that ``G`` is estimated.)
 """
 
 from __future__ import annotations

@@ -81,9 +81,9 @@ def predict_bands(
         for _, outputs in episode.replay.chunks(draws):
             for total, target in zip(sums, episode.targets, strict=True):
                 shown = target.predicted(outputs)
-                shown = shown[np.isfinite(shown).all(axis=(1, 2))]
+                shown = shown[np.isfinite(shown[:, target.mask]).all(axis=1)]
                 # about the measured signal: sums of squares of small numbers lose no digits
-                off = shown - np.nan_to_num(target.measured)
+                off = np.nan_to_num(shown) - np.nan_to_num(target.measured)
                 total += np.stack([np.full(target.mask.shape, float(len(off))), off.sum(0), (off**2).sum(0)])
         label = f" ({log.path.stem})" if several and log.path is not None else ""
         for (count, first, second), target in zip(sums, episode.targets, strict=True):
@@ -97,7 +97,7 @@ def predict_bands(
                         channel=target.channel,
                         joint=joint + label,
                         unit=_unit(target.channel, episode.replay.model, joint),
-                        time=log.time - log.time[0],
+                        time=(log.time - log.time[0])[: len(target.measured)],
                         measured=target.measured[:, k],
                         mean=center[:, k],
                         spread=spread[:, k],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
 ROUND = 10
-"""Steps of every ensemble between two looks at convergence."""
+"""Steps of every ensemble between two looks at convergence; a tenth of the chain once that is more."""
 BURN_IN = 5.0
 """Autocorrelation times dropped from the beginning of every chain."""
 SUBSTEPS = 30
@@ -162,6 +162,11 @@ class Sample:
     seconds: float
 
     @property
+    def gain(self) -> float:
+        """Log-likelihood by which the best draw exceeds the fit; above 0 the fit was not the best there is."""
+        return float(self.log_likelihood.max())
+
+    @property
     def flat(self) -> FloatArray:
         """All draws, (draws, p)."""
         return self.draws.reshape(-1, self.draws.shape[-1])
@@ -217,9 +222,10 @@ def sample(
                 _Run.begin(target, begin, Proposal(target.foretold, guess, settings.substeps, source), settings)
             )
         while runs[0].steps < settings.max_steps:
-            for i, run in enumerate(runs):
-                target.note = f"ensemble {i + 1} of {len(runs)}, {outlook.said}"
-                run.advance(ROUND)
+            for _ in range(max(ROUND, runs[0].steps // ROUND)):
+                for i, run in enumerate(runs):
+                    target.note = f"ensemble {i + 1} of {len(runs)}, {outlook.said}"
+                    run.advance()
             found = assess([run.chain for run in runs])
             outlook.see(found, settings, evaluator.evaluations, runs[0].steps)
             if found.reached(settings):
@@ -233,8 +239,8 @@ def sample(
         raise NotConvergedError(
             f"sampling ended after {outcome.evaluations} replays, before there was a draw: "
             f"{settings.ensembles} ensembles of {walkers} walkers need "
-            f"{settings.ensembles * walkers} replays a step, and at least {settings.fewest_steps} steps. "
-            f"{_MESSAGES.get(outcome.termination, outcome.termination.value)}"
+            f"{settings.ensembles * walkers} replays a step, and at least {settings.fewest_steps} steps: "
+            "raise --max-evaluations, or go on with --resume"
         )
     return _collect(problem.names, runs, likelihood, outcome.termination, outcome.evaluations, outcome.seconds)
 
@@ -301,7 +307,9 @@ class _Run:
     sampler: Any
     state: Any
     proposal: Proposal
-    accepted: float = 0.0
+    visited: list[FloatArray] = field(default_factory=list)
+    density: list[FloatArray] = field(default_factory=list)
+    accepted: int = 0
     proposed: int = 0
 
     @classmethod
@@ -323,22 +331,23 @@ class _Run:
     @property
     def steps(self) -> int:
         """Finished steps of all walkers."""
-        return int(self.sampler.iteration)
+        return len(self.visited)
 
     @property
     def chain(self) -> FloatArray:
         """(steps, walkers, p) in the unit cube."""
-        return bounded(self.sampler.get_chain())
+        return bounded(np.array(self.visited))
 
-    def advance(self, steps: int) -> None:
-        """So many more steps."""
-        for _ in range(steps):
-            made, taken = self.proposal.made, float(self.sampler.backend.accepted.sum())
-            for state in self.sampler.sample(self.state, iterations=1, skip_initial_state_check=True):
-                self.state = state
-            if self.proposal.made > made:
-                self.proposed += self.proposal.made - made
-                self.accepted += float(self.sampler.backend.accepted.sum()) - taken
+    def advance(self) -> None:
+        """One more step of every walker."""
+        made, before = self.proposal.made, np.array(self.state.coords)
+        for state in self.sampler.sample(self.state, iterations=1, store=False, skip_initial_state_check=True):
+            self.state = state
+        self.visited.append(np.array(self.state.coords))
+        self.density.append(np.array(self.state.log_prob))
+        if self.proposal.made > made:
+            self.proposed += self.proposal.made - made
+            self.accepted += int(np.any(self.visited[-1] != before, axis=1).sum())
 
 
 def _stretch() -> Any:
@@ -408,8 +417,8 @@ def _collect(
         return np.stack([get(run)[window] for run in runs])
 
     target = runs[0].target
-    v = stacked(lambda run: np.asarray(run.sampler.get_chain()))
-    density = stacked(lambda run: np.asarray(run.sampler.get_log_prob()))
+    v = stacked(lambda run: np.array(run.visited))
+    density = stacked(lambda run: np.array(run.density))
     flat, flat_density = v.reshape(-1, v.shape[-1]), density.reshape(-1)
     u = bounded(flat)
     log_likelihood = target.log_likelihood(flat, flat_density)

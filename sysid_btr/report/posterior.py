@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sysid_btr.identify.profile import Profile
-    from sysid_btr.posterior.posterior import Posterior
+    from sysid_btr.posterior.draw import Posterior
     from sysid_btr.posterior.predictive import Band
 
 INK, FAINT, MODEL, FITTED = "#1f2328", "#8b949e", "#2e9e6b", "#d1495b"

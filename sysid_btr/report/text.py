@@ -58,6 +58,10 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
     if result.get("signature"):
         yield Text("what is left: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
+    for p in result.get("profiles", []):
+        ends = zip(p["ci95"], p["closed"], strict=True)
+        low, high = (number(end) + ("" if closed else " (not closed)") for end, closed in ends)
+        yield Text(f"profile of {p['name']}: 95 % within {low} .. {high}, the others fitted anew")
     if result.get("converged") is False:
         yield Text(result["termination"], style="bold")
     for walk in result.get("walks", []):

@@ -1,0 +1,516 @@
+"""The Back-to-Reality loop (section 3.3 of the paper).
+
+The loop has no state of its own on disk. Every random number follows from the seed, the iteration and the step;
+every simulation is answered by the journal of its step, and every trial by its file, if there is one. So a run that
+was killed is begun again, and comes to where it was, to the bit, without repeating anything.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from sysid_btr import __version__
+from sysid_btr._typing import FloatArray
+from sysid_btr.btr.choice import Pool, get_choice, pool_of
+from sysid_btr.btr.closing import Joined, join_effects
+from sysid_btr.btr.controllers import ControllerSpace
+from sysid_btr.btr.correction import linear_correction
+from sysid_btr.btr.exchange import quiet
+from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, Stage
+from sysid_btr.btr.robot import Robot
+from sysid_btr.btr.task import Walk
+from sysid_btr.btr.trials import TrialBook, Tried
+from sysid_btr.btr.world import make_world
+from sysid_btr.errors import InterruptedRun, UsageError
+from sysid_btr.estimators.base import Budget, Estimator, FitResult, Problem, Progress, Termination, silent
+from sysid_btr.estimators.cma_es import CmaEs
+from sysid_btr.estimators.ga import GeneticAlgorithm
+from sysid_btr.estimators.journal import Journal
+from sysid_btr.models.modifier import Modifier, Parameter
+from sysid_btr.models.robot import Robot as Model
+from sysid_btr.objectives.distance import get_distance
+
+PATIENCE = 3
+"""Iterations without progress after which disengagement is looked for."""
+UNTOLD = 0.2
+"""Rank correlation of expected and real fitness up to which the model does not tell which controller is better."""
+UNEXPLAINED = 3.0
+"""Position error of the best model, in noise floors, above which something may be missing ..."""
+STUCK = 0.9
+"""... if Step 3 leaves more than this fraction of the loss it began with."""
+
+STEPS = {"controllers": 1, "models": 3}
+"""Searches of an iteration by the paper's numbers."""
+
+
+FLIPS, BITS = 4.3, 8
+"""Bits by which a controller's children differ from it on average, and bits of each of its numbers."""
+
+
+def controller_search(numbers: int = 36) -> GeneticAlgorithm:
+    """Step 1 as in the paper's Fig. 3: 11 generations of 20, by a few mutations of the last controller.
+
+    Parameters
+    ----------
+    numbers : of a controller.
+    """
+    mutation = min(max(round(FLIPS / (BITS * numbers), 3), 0.001), 0.5)
+    return GeneticAlgorithm(population=20, generations=11, bits=BITS, mutation=mutation)
+
+
+def first_controller_search() -> GeneticAlgorithm:
+    """Step 1 of the first iteration: far from the controller known beforehand, which may not move at all."""
+    return GeneticAlgorithm(population=20, generations=11, bits=BITS)
+
+
+def model_search() -> CmaEs:
+    """Step 3 with as many models as in the paper's Fig. 3, 11 generations of 15, but told apart more finely."""
+    return CmaEs(population=15, max_generations=11, sigma=0.15)
+
+
+def papers_model_search() -> GeneticAlgorithm:
+    """Step 3 as in the paper's Fig. 3: 11 generations of 15."""
+    return GeneticAlgorithm(population=15, generations=11, bits=10)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the loop may spend and how it decides.
+
+    Attributes
+    ----------
+    iterations : at most.
+    trials : controllers tried in each (m in the paper); with a distance of sensors one or two will do.
+    first, controllers : Step 1 in the first iteration and in the others.
+    models : Step 3.
+    distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse``, ``wasserstein`` or ``likelihood``.
+    choice : of trials, ``fittest`` or ``disagreement``.
+    memory : trials that Step 3 explains, the newest first; those before are taken evenly.
+    rivals : candidate models that may disagree.
+    requirement : real fitness with which the work is done.
+    close : look for missing effects where Step 3 cannot explain the robot's logs.
+    correct : leave the model as it is and correct its fitness linearly instead (a baseline).
+    """
+
+    iterations: int = 13
+    trials: int = 12
+    first: Estimator = field(default_factory=first_controller_search)
+    controllers: Estimator = field(default_factory=controller_search)
+    models: Estimator = field(default_factory=model_search)
+    distance: str = FITNESS
+    choice: str = "fittest"
+    memory: int = 12
+    rivals: int = 5
+    requirement: float | None = None
+    close: bool = False
+    correct: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.iterations, self.trials, self.memory, self.rivals) < 1:
+            raise UsageError("btr: iterations, trials, memory and rivals must be at least 1")
+        if self.close and self.correct:
+            raise UsageError("btr: with a linear correction the model stays as it is; nothing can be added to it")
+        get_choice(self.choice)
+        if self.distance != FITNESS:
+            get_distance(self.distance)
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration:
+    """One round of the loop.
+
+    Attributes
+    ----------
+    number : from 1.
+    controller, expected : the fittest of Step 1, (p,), and its fitness in the model.
+    expected_mean : mean fitness of the last generation.
+    tried : on the robot.
+    transfer : mean absolute difference of expected and real fitness of these, before the model was corrected.
+    names : of the model's parameters, which `close` may add to.
+    model : (q,) the model after Step 3.
+    loss, loss_before, loss_mean : distance of this model, of the last one, and mean of the last generation, to the
+        trials that Step 3 explains.
+    population, losses : all models that Step 3 looked at, (k, q) and (k,).
+    population_names : of their parameters, before `close` added to them.
+    delta : mean absolute difference of fitness between this model and the robot on the trials of this iteration.
+    noise : position error of this model in noise floors on them; NaN where nothing was logged.
+    best : largest real fitness so far.
+    joined : what `close` said, if it ran.
+    """
+
+    number: int
+    controller: FloatArray
+    expected: float
+    expected_mean: float
+    tried: tuple[Tried, ...]
+    transfer: float
+    names: tuple[str, ...]
+    model: FloatArray
+    loss: float
+    loss_before: float
+    loss_mean: float
+    population: FloatArray
+    losses: FloatArray
+    delta: float
+    noise: float
+    best: float
+    joined: str = ""
+    population_names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class BackToReality:
+    """What the loop ended with.
+
+    Attributes
+    ----------
+    stage, model : the best model: what runs it, and its numbers (q,).
+    iterations : all rounds.
+    best : the fittest controller on the robot.
+    reason : why it ended, a sentence.
+    finished : whether it ended because the requirement was met or the iterations done.
+    settings, seed : as given.
+    simulations : evaluations of Steps 1 and 3.
+    seconds : wall time of this run.
+    """
+
+    stage: Stage
+    model: FloatArray
+    iterations: tuple[Iteration, ...]
+    best: Tried
+    reason: str
+    finished: bool
+    settings: Settings
+    seed: int
+    simulations: int
+    seconds: float
+
+    @property
+    def tried(self) -> tuple[Tried, ...]:
+        """All trials, in order."""
+        return tuple(t for i in self.iterations for t in i.tried)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Of the best model."""
+        return self.stage.parameters
+
+
+def back_to_reality(
+    model: Model,
+    modifiers: Sequence[Modifier],
+    robot: Robot,
+    space: ControllerSpace,
+    *,
+    task: Walk,
+    settings: Settings | None = None,
+    seed: int = 0,
+    folder: Path | None = None,
+    threads: int = 0,
+    progress: Progress = silent,
+    say: Callable[[str], None] = quiet,
+) -> BackToReality:
+    """Find a controller that works on the robot, and a model that says so.
+
+    Parameters
+    ----------
+    model, modifiers : the model, and what of it is unknown.
+    robot : on which controllers are tried.
+    space, task : controllers, and what they are for.
+    settings : default those of the paper's ant.
+    seed : of all random numbers.
+    folder : where journals and trials are kept; a run that finds its own goes on with them. None keeps nothing.
+    threads : worker threads, 0 for all cores.
+    progress, say : told of evaluations, and of what was found.
+
+    Raises
+    ------
+    InterruptedRun
+        If the user stopped a search; what was done is kept.
+    UsageError
+        If the folder holds another run's work.
+    """
+    if not modifiers:
+        raise UsageError("nothing of the model is unknown: name what the trials may correct (--fit)")
+    settings = Settings() if settings is None else settings
+    loop = _Loop(model, robot, space, task, settings, seed, folder, threads, progress, say, tuple(modifiers))
+    return loop.go()
+
+
+@dataclass(eq=False)
+class _Loop:
+    """The loop while it runs: the model so far, the trials, the rounds."""
+
+    model: Model
+    robot: Robot
+    space: ControllerSpace
+    task: Walk
+    settings: Settings
+    seed: int
+    folder: Path | None
+    threads: int
+    progress: Progress
+    say: Callable[[str], None]
+    modifiers: tuple[Modifier, ...]
+    simulations: int = 0
+
+    def __post_init__(self) -> None:
+        self.book = TrialBook(None if self.folder is None else self.folder / "trials")
+        self.stage = self._stage(self.modifiers)
+        self.values = np.array([p.nominal for p in self.stage.parameters])
+        self.rounds: list[Iteration] = []
+        self.rivals = self.values[None]
+        self._print = self._fingerprint()
+
+    def _stage(self, modifiers: tuple[Modifier, ...]) -> Stage:
+        return Stage(make_world(self.model, self.task, modifiers, threads=self.threads), self.task, self.space)
+
+    def _fingerprint(self) -> str:
+        """Digest of all that decides which simulations are run; not of how long the loop goes on."""
+        settings = replace(self.settings, iterations=1, requirement=None)
+        parameters = [(p.name, p.nominal, p.lower, p.upper) for p in self.stage.parameters]
+        bounds = [self.space.lower.tolist(), self.space.upper.tolist(), self.space.start.tolist()]
+        content = [__version__, self.model.digest, parameters, bounds, repr(self.task), repr(settings), self.seed]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+    def go(self) -> BackToReality:
+        began = perf_counter()
+        reason, finished = "", True
+        for number in range(1, self.settings.iterations + 1):
+            self.rounds.append(self._round(number))
+            self.say(_line(self.rounds[-1]))
+            best = self.rounds[-1].best
+            if self.settings.requirement is not None and best >= self.settings.requirement:
+                reason = f"The requirement is met: {best:.4g} m/s on the robot after {len(self.book.made)} trials."
+                break
+            away = disengaged(self.rounds)
+            if away:
+                reason, finished = away, False
+                break
+        else:
+            reason = f"All {self.settings.iterations} iterations are done."
+        best_tried = self.book.best
+        assert best_tried is not None
+        return BackToReality(
+            stage=self.stage,
+            model=self.values,
+            iterations=tuple(self.rounds),
+            best=best_tried,
+            reason=reason,
+            finished=finished,
+            settings=self.settings,
+            seed=self.seed,
+            simulations=self.simulations,
+            seconds=perf_counter() - began,
+        )
+
+    def _round(self, number: int) -> Iteration:
+        found, journal = self._search_controllers(number)
+        pool = pool_of(journal.records, self.book.known)
+        for row in self._choose(pool):
+            self.book.add(self.robot, number, pool.controllers[row], float(pool.expected[row]))
+        tried = self.book.of(number)
+        last = journal.records[-1].arrays["loss"] if journal.records else np.full(1, np.nan)
+        transfer = _mean([abs(t.expected - t.trial.fitness) for t in tried if t.trial.outcome != "crashed"])
+        joined, before = "", self.values
+        names = tuple(p.name for p in self.stage.parameters)
+        problem = self._model_problem(self._remembered(), before)
+        searched = self._search_model(number, problem)
+        if searched is not None and self.settings.close and self._stuck(problem, searched[1]):
+            joined = self._close(number)
+            if joined:
+                problem = self._model_problem(self._remembered(), self.values)
+        report = self._report(number, found, last, tried, transfer, problem, searched, joined)
+        return replace(report, population_names=names)
+
+    def _search_controllers(self, number: int) -> tuple[FitResult, Journal]:
+        """Step 1."""
+        best = self.book.best
+        start = self.space.start if best is None else best.controller.values
+        correction = linear_correction(self.stage, self.values, self.book.made) if self.settings.correct else None
+        problem = ControllerProblem(self.stage, self.values, start, correction)
+        estimator = self.settings.first if number == 1 else self.settings.controllers
+        return self._search(number, "controllers", estimator, problem)
+
+    def _choose(self, pool: Pool) -> list[int]:
+        """Step 2."""
+        choose = get_choice(self.settings.choice)
+        return choose(pool, self.settings.trials, lambda some: self.stage.fitness(some, self.rivals))
+
+    def _remembered(self) -> list[Tried]:
+        """Trials that Step 3 explains: half of them the newest, the others from all before, evenly."""
+        usable = [t for t in self.book.made if t.trial.outcome != "crashed"]
+        count = self.settings.memory
+        if len(usable) <= count:
+            return usable
+        newest = usable[len(usable) - (count + 1) // 2 :]
+        earlier = usable[: len(usable) - len(newest)]
+        rows = np.unique(np.linspace(0, len(earlier) - 1, count - len(newest)).astype(np.int64))
+        return [*(earlier[i] for i in rows), *newest]
+
+    def _model_problem(self, tried: Sequence[Tried], start: FloatArray) -> ModelProblem:
+        width = len(self.space.names)
+        controllers = np.array([t.controller.values for t in tried]).reshape(len(tried), width)
+        return ModelProblem(self.stage, controllers, [t.trial for t in tried], self.settings.distance, start)
+
+    def _search_model(self, number: int, problem: ModelProblem) -> tuple[FloatArray, Journal] | None:
+        """Step 3; None where there is nothing to explain, or the model stays as it is."""
+        if self.settings.correct or not problem.trials:
+            return None
+        if problem.distance != FITNESS and not problem.targets:
+            return None
+        found, journal = self._search(number, "models", self.settings.models, problem)
+        if not np.isfinite(found.loss):
+            return None
+        self.values = found.x
+        candidates, losses = _all_of(journal)
+        order = np.argsort(losses, kind="stable")
+        order = order[np.isfinite(losses[order])]
+        self.rivals = _distinct(candidates[order])[: self.settings.rivals]
+        return found.x, journal
+
+    def _search(self, number: int, step: str, estimator: Estimator, problem: Problem) -> tuple[FitResult, Journal]:
+        label = f"{number:02d}_{STEPS[step]}_{step}"
+        path = None if self.folder is None else self.folder / "journals" / f"{label}.jsonl"
+        journal = Journal(path, fingerprint=f"{self._print}/{label}")
+        rng = np.random.default_rng([self.seed, number, STEPS[step]])
+        noted = _noted(self.progress, f"iteration {number}, {step}")
+        found = estimator.fit(problem, rng=rng, budget=Budget(), journal=journal, progress=noted)
+        if found.termination is Termination.INTERRUPTED:
+            raise InterruptedRun(f"interrupted in iteration {number}, {step}; what is done is kept")
+        self.simulations += found.evaluations * (len(problem.trials) if isinstance(problem, ModelProblem) else 1)
+        return found, journal
+
+    def _stuck(self, problem: ModelProblem, journal: Journal) -> bool:
+        """Whether Step 3 found hardly anything better, and the sensors say that something is missing."""
+        losses = _all_of(journal)[1]
+        little = float(np.min(losses)) > STUCK * float(losses[0])
+        return little and bool(problem.targets) and problem.noise(self.values) > UNEXPLAINED
+
+    def _close(self, number: int) -> str:
+        """Name missing effects and add them to the model; what was found, in words."""
+        kept = None if self.folder is None else self.folder / "closings" / f"{number:02d}.json"
+        joined: Joined = join_effects(self.model, self.modifiers, self.values, self.book.made, kept, self.threads)
+        if joined.modifiers:
+            self.modifiers = joined.modifiers
+            self.stage = self._stage(self.modifiers)
+            self.values = np.clip(
+                joined.values,
+                [p.lower for p in self.stage.parameters],
+                [p.upper for p in self.stage.parameters],
+            )
+            self.rivals = self.values[None]
+        return joined.message
+
+    def _report(
+        self,
+        number: int,
+        found: FitResult,
+        last: FloatArray,
+        tried: list[Tried],
+        transfer: float,
+        problem: ModelProblem,
+        searched: tuple[FloatArray, Journal] | None,
+        joined: str,
+    ) -> Iteration:
+        candidates, losses = (self.values[None], np.full(1, np.nan)) if searched is None else _all_of(searched[1])
+        own = self._model_problem([t for t in tried if t.trial.outcome != "crashed"], self.values)
+        delta = float(replace(own, distance=FITNESS).loss(self.values[None])[0]) if own.trials else float("nan")
+        latest = losses if searched is None else searched[1].records[-1].arrays["loss"]
+        best = self.book.best
+        return Iteration(
+            number=number,
+            controller=found.x,
+            expected=-found.loss,
+            expected_mean=-_mean(last[np.isfinite(last)]),
+            tried=tuple(tried),
+            transfer=transfer,
+            names=problem.names,
+            model=self.values,
+            loss=float(np.min(losses)),
+            loss_before=float(losses[0]),
+            loss_mean=_mean(latest[np.isfinite(latest)]),
+            population=candidates,
+            losses=losses,
+            delta=delta,
+            noise=own.noise(self.values) if own.targets else float("nan"),
+            best=float("nan") if best is None else best.trial.fitness,
+            joined=joined,
+        )
+
+
+def disengaged(rounds: Sequence[Iteration]) -> str:
+    """Why the two searches have lost hold of each other, if they have; else nothing.
+
+    In the last `PATIENCE` iterations nothing better was found on the robot, and the order in which the model puts
+    controllers tells nothing of the order in which the robot does: selection in one has no influence in the other.
+    """
+    if len(rounds) <= PATIENCE or rounds[-1].best > rounds[-1 - PATIENCE].best:
+        return ""
+    tried = [t for r in rounds[-PATIENCE:] for t in r.tried if t.trial.outcome != "crashed"]
+    expected = np.array([t.expected for t in tried])
+    real = np.array([t.trial.fitness for t in tried])
+    if not tried and rounds[-1].tried:
+        return f"Disengaged: every trial of the last {PATIENCE} iterations crashed."
+    if not tried:
+        return f"Disengaged: the last {PATIENCE} iterations found no controller that was not tried before."
+    if len(tried) < 2 * PATIENCE or np.ptp(real) == 0:
+        return ""
+    told = _rank_correlation(expected, real)
+    if told > UNTOLD:
+        return ""
+    return (
+        f"Disengaged: nothing better was found on the robot in {PATIENCE} iterations, and the model does not tell "
+        f"which controller is better there (rank correlation {told:.2f} over {len(tried)} trials). The model lacks "
+        "something that the robot has: free other parameters, or let missing effects be looked for (--close)."
+    )
+
+
+def _rank_correlation(a: FloatArray, b: FloatArray) -> float:
+    from scipy.stats import rankdata
+
+    x, y = rankdata(a), rankdata(b)
+    if np.ptp(x) == 0 or np.ptp(y) == 0:
+        return 0.0
+    return float(np.corrcoef(x, y)[0, 1])
+
+
+def _all_of(journal: Journal) -> tuple[FloatArray, FloatArray]:
+    """All candidates of a search and their losses, in order."""
+    records = journal.records
+    return np.concatenate([r.candidates for r in records]), np.concatenate([r.arrays["loss"] for r in records])
+
+
+def _distinct(rows: FloatArray) -> FloatArray:
+    """Rows without repetitions, in order."""
+    first = np.unique(rows, axis=0, return_index=True)[1]
+    return np.asarray(rows[np.sort(first)])
+
+
+def _noted(progress: Progress, where: str) -> Progress:
+    def report(*, done: int, total: int | None, best: float, note: str) -> None:
+        progress(done=done, total=total, best=best, note=f"{where}, {note}" if note else where)
+
+    return report
+
+
+def _mean(values: FloatArray | list[float]) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _line(r: Iteration) -> str:
+    fell = sum(t.trial.outcome != "done" for t in r.tried)
+    parts = [
+        f"iteration {r.number}: {len(r.tried)} trials" + (f" ({fell} fell or crashed)" if fell else ""),
+        f"best on the robot {r.best:.4g} m/s",
+        f"expected {r.expected:.4g}",
+        f"fitness differs by {r.transfer:.2g} before, {r.delta:.2g} after correction of the model",
+    ]
+    return ", ".join(parts) + (f"; {r.joined}" if r.joined else "")

@@ -1,0 +1,194 @@
+"""Robots on the ground, given commands from a standing start: controllers times models in one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.btr.task import Walk
+from sysid_btr.errors import ModelError
+from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.modifier import Index, Modifier, Outputs, Rig
+from sysid_btr.models.robot import Robot
+from sysid_btr.replay.engine import CHUNK, Numerics, Replay, _setconst_inputs, make_index
+from sysid_btr.replay.quiet import quiet
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco.batch import Batch
+
+STEP = 0.005
+"""s, longest step: MuJoCo's contacts have time constants of 20 ms."""
+
+
+@dataclass(frozen=True)
+class World(Replay):
+    """A replay whose commands are those of many controllers, from standing on the ground; records the base.
+
+    The robot stands with its joints where the first command wants them, its lowest point on the floor at z = 0.
+    """
+
+    @cached_property
+    def index(self) -> Index:
+        model = self.model
+        free = np.flatnonzero(model.jnt_type == 0)
+        if len(free) != 1:
+            raise ModelError(
+                f"model {self.robot.name}: {len(free)} free joints; a robot that walks has one, at its base"
+            )
+        joint = int(free[0])
+        return replace(make_index(model), base=(int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])))
+
+    def spread(self, joints: Sequence[str], commands: FloatArray) -> FloatArray:
+        """Commands (m, n, joints given) for all joints of the model, (m, n, j); the others stay where they are."""
+        result = np.tile(self.model.qpos0[self.index.qpos], (*commands.shape[:2], 1))
+        result[:, :, self.index.of(joints)] = commands
+        return np.asarray(result)
+
+    def run(self, commands: FloatArray, values: FloatArray) -> Iterator[tuple[slice, Outputs]]:
+        """Motions, a chunk at a time.
+
+        Parameters
+        ----------
+        commands : (m, n, j) at the samples of the log, for all joints of the model, held until the next one.
+        values : (m, p) candidate of each run.
+
+        Yields
+        ------
+        (slice, Outputs)
+            Rows, and motions with their base. A run that diverged, or whose commands are not finite, is all NaN.
+        """
+        for first in range(0, len(commands), CHUNK):
+            rows = slice(first, min(first + CHUNK, len(commands)))
+            good: BoolArray = np.asarray(np.isfinite(commands[rows]).all(axis=(1, 2)))
+            with quiet():
+                outputs = self._walk(np.where(good[:, None, None], commands[rows], 0.0), values[rows])
+            for array in (outputs.position, outputs.velocity, outputs.base):
+                if array is not None:
+                    array[~good] = np.nan
+            yield rows, outputs
+
+    def _walk(self, commands: FloatArray, values: FloatArray) -> Outputs:
+        from mujoco.batch import Batch
+
+        m, grid, index = len(commands), self.grid, self.index
+        pairs = self._values(values)
+        batch = Batch(self.model, m, self.threads)
+        rig = self._rig(batch, pairs)
+        held = np.repeat(commands[:, :-1], grid.steps // (commands.shape[1] - 1), axis=1)
+        qpos, qvel = commands[:, 0].copy(), np.zeros((m, len(index.joints)))
+        applied: FloatArray | None = None
+        border_time = self.grid.timestep * np.arange(grid.steps + 1, dtype=np.float64)
+        for modifier, own in pairs:
+            modifier.initial_state(rig, own, qpos, qvel)
+            held = modifier.shape_command(rig, own, held)
+            torque = modifier.applied_torque(rig, own, border_time)
+            if torque is not None:
+                applied = torque if applied is None else applied + torque
+        batch.bind("qpos")[:, index.qpos] = qpos
+        batch.bind("qvel")[:, index.dof] = qvel
+        assert index.base is not None
+        batch.bind("qpos")[:, index.base[0] + 2] -= lowest(self.model, batch)
+        return self._go(rig, pairs, held, applied, grid)
+
+    def _rig(self, batch: Batch, pairs: list[tuple[Modifier, FloatArray]]) -> Rig:
+        rig = Rig(self.model, batch, self.index, self.numerics.timestep)
+        for modifier, own in pairs:
+            modifier.write_fields(rig, own)
+        if rig.touched & set(_setconst_inputs()):
+            batch.set_const()
+        return rig
+
+    def sensors(self, outputs: Outputs, command: FloatArray, values: FloatArray) -> dict[str, FloatArray]:
+        """The model's own sensors by name, (n, size) each, along the first of some motions.
+
+        Parameters
+        ----------
+        outputs : motions with their base.
+        command : (n, j) of that motion.
+        values : (p,) its candidate.
+        """
+        from mujoco.batch import Batch
+
+        n, index = len(command), self.index
+        assert index.base is not None
+        assert outputs.base is not None
+        batch = Batch(self.model, n, self.threads)
+        self._rig(batch, self._values(np.tile(values, (n, 1))))
+        qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+        place, motion = index.base
+        qpos[:, place : place + 7], qvel[:, motion : motion + 6] = outputs.base[0, :, :7], outputs.base[0, :, 7:]
+        qpos[:, index.qpos], qvel[:, index.dof] = outputs.position[0], outputs.velocity[0]
+        driven = index.actuator >= 0
+        batch.bind("ctrl")[:, index.actuator[driven]] = command[:, driven]
+        data = batch.bind("sensordata")
+        batch.forward()
+        first = self.model.sensor_adr
+        return {
+            self.model.sensor(s).name: data[:, first[s] : first[s] + self.model.sensor_dim[s]].copy()
+            for s in range(self.model.nsensor)
+        }
+
+
+def lowest(model: mujoco.MjModel, batch: Batch) -> FloatArray:
+    """Height (m,) of the lowest point of what can touch the ground, in each simulation's present pose."""
+    place, turn = batch.bind("geom_xpos"), batch.bind("geom_xmat")
+    batch.forward(stage=1)
+    sizes = batch.expanded("geom_size")
+    sizes = np.broadcast_to(model.geom_size, (batch.nsim, *model.geom_size.shape)) if sizes is None else sizes
+    heights = [
+        place[:, g, 2] - _reach(int(model.geom_type[g]), sizes[:, g], turn.reshape(batch.nsim, -1, 9)[:, g, 6:])
+        for g in feet_geoms(model)
+    ]
+    return np.min(heights, axis=0) if heights else np.zeros(batch.nsim)
+
+
+def feet_geoms(model: mujoco.MjModel) -> IntArray:
+    """Geoms of moving bodies that can collide with what is fixed to the world."""
+    still = model.body_weldid[model.geom_bodyid] == 0
+    types, affinities = model.geom_contype[still], model.geom_conaffinity[still]
+    meets = (model.geom_contype[:, None] & affinities) | (types & model.geom_conaffinity[:, None])
+    return np.flatnonzero(~still & meets.any(axis=1))
+
+
+def _reach(kind: int, size: FloatArray, up: FloatArray) -> FloatArray:
+    """How far a geom extends below its centre, (m,); `up` is the world's vertical in its frame, (m, 3)."""
+    import mujoco
+
+    types = mujoco.mjtGeom
+    along = np.abs(up[:, 2])
+    if kind == types.mjGEOM_SPHERE:
+        return size[:, 0]
+    if kind == types.mjGEOM_CAPSULE:
+        return np.asarray(size[:, 0] + size[:, 1] * along)
+    if kind == types.mjGEOM_CYLINDER:
+        return np.asarray(size[:, 1] * along + size[:, 0] * np.sqrt(np.maximum(1 - along**2, 0.0)))
+    return np.asarray(np.sum(size * np.abs(up), axis=1))  # boxes, and others by their box
+
+
+def make_world(
+    robot: Robot, task: Walk, modifiers: Sequence[Modifier] = (), *, halvings: int = 0, threads: int = 0
+) -> World:
+    """The world of a robot and a task.
+
+    Parameters
+    ----------
+    robot, modifiers : the model and what of it a candidate changes.
+    task : length and sampling of a trial.
+    halvings : times the step is halved below the one that the model states (at most `STEP`).
+    threads : worker threads, 0 for all cores.
+    """
+    own = float(robot.compile().opt.timestep)
+    step = task.period / np.ceil(task.period / min(own, STEP) - 1e-9) / 2**halvings
+    log = Log(
+        time=task.time,
+        channels={},
+        meta=LogMeta(robot=robot.name, mount="free", sample_period=task.period),
+        episode=np.zeros(len(task.time), dtype=np.int64),
+    )
+    return World(robot, log, tuple(modifiers), Numerics("implicitfast", float(step)), threads=threads)
