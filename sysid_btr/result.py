@@ -194,7 +194,7 @@ def _of_posterior(posterior: Posterior) -> dict[str, Any]:
             "replays": drawn.evaluations,
         },
         "surrogate": {
-            "method": "linearised residuals; every draw accepted by a real replay (surrogate transition)",
+            "method": "quadratic model of the residuals, each proposal judged by a real replay (surrogate transition)",
             "acceptance": drawn.surrogate.acceptance,
             "log_likelihood_error": drawn.surrogate.error,
             "proposals": drawn.surrogate.proposals,

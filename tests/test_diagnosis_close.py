@@ -244,11 +244,6 @@ PLANTS = [
 ]
 
 
-COM_OFFSET = pytest.mark.xfail(
-    strict=False,
-    reason="verdict ambiguous: payload at ankle and knee (0.050 kg, 0.094 kg) with com_offset as its rival; com_offset "
-    "at the ankle alone, three parameters instead of eight, is not the one that is kept",
-)
 SLEW_FLOOR = pytest.mark.xfail(
     strict=False, reason="named rightly (2.490 rad/s for 2.5), but held-out rmse stays at 1.24 noise floors"
 )
@@ -259,7 +254,7 @@ def marked(name: str, mark: pytest.MarkDecorator) -> list[Any]:
     return [pytest.param(p, marks=[mark] if str(p) == name else [], id=str(p)) for p in PLANTS]
 
 
-@pytest.mark.parametrize("plant", marked("com_offset", COM_OFFSET))
+@pytest.mark.parametrize("plant", PLANTS, ids=str)
 def test_a_planted_effect_is_named_where_it_is(plant: Plant) -> None:
     found = diagnose(plant)
     assert found.verdict in ("explained", "ambiguous"), found.message

@@ -183,9 +183,7 @@ def test_the_draws_are_exact_however_wrong_the_surrogate(
 
 def test_candidates_that_fail_are_never_drawn() -> None:
     toy = failing_region(np.random.default_rng(20), fraction=0.1)
-    best = LeastSquares().fit(
-        toy, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
-    )
+    best = LeastSquares().fit(toy, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent)
     x, residual, jacobian, _ = settle(toy, best.x)
     found = draw(toy, make_likelihood(toy, x, residual, jacobian, None))
     assert found.converged
@@ -201,9 +199,7 @@ def test_a_better_minimum_than_the_fits_is_found_and_told() -> None:
         lambda x: np.stack([4.0 * (x[:, 0] ** 2 - 1.0), 1.5 * (x[:, 0] - 1.0)], axis=1),
         np.array([1.0]),
     )
-    worse = LeastSquares().fit(
-        toy, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
-    )
+    worse = LeastSquares().fit(toy, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent)
     assert worse.x[0] < 0
     found = draw(toy, plain(toy, worse.x), draws=500.0, budget=Budget(evaluations=6000))
     assert found.gain == pytest.approx(0.5 * worse.loss, rel=0.05)
@@ -235,9 +231,7 @@ def test_ranks_of_the_truth_are_uniform() -> None:
             return np.asarray((decay(x) - seen) / noise)
 
         toy = ToyProblem(("size", "rate"), lower, upper, 0.5 * (lower + upper), residuals, truth)
-        best = LeastSquares(confirm=False).fit(
-            toy, rng=rng, budget=Budget(), journal=Journal(), progress=silent
-        )
+        best = LeastSquares(confirm=False).fit(toy, rng=rng, budget=Budget(), journal=Journal(), progress=silent)
         x, residual, jacobian, _ = settle(toy, best.x)
         found = sample(
             toy,
@@ -261,9 +255,7 @@ def test_ranks_of_the_truth_are_uniform() -> None:
 def correlated(rng: np.random.Generator, blocks: int = 200, length: int = 10) -> tuple[ToyProblem, FloatArray]:
     """A linear problem whose residuals repeat themselves within each block: ten samples tell what one does."""
     label = np.repeat(np.arange(blocks), length)
-    design = np.column_stack(
-        [np.repeat(rng.standard_normal(blocks), length), rng.standard_normal(blocks * length)]
-    )
+    design = np.column_stack([np.repeat(rng.standard_normal(blocks), length), rng.standard_normal(blocks * length)])
     target = design @ np.array([0.5, -0.3]) + np.repeat(rng.standard_normal(blocks), length)
     best = np.linalg.lstsq(design, target, rcond=None)[0]
     toy = ToyProblem(

@@ -246,9 +246,7 @@ def test_mistakes_are_told_before_the_work(cli: Cli, argv: tuple[str, ...], said
     assert said in answer.err
 
 
-def test_a_missing_package_is_named_with_its_extra(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_missing_package_is_named_with_its_extra(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def missing(name: str) -> Any:
         if name == "corner":
             raise ModuleNotFoundError("No module named 'corner'", name="corner")

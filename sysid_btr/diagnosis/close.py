@@ -192,6 +192,10 @@ def close(
     final_estimates: tuple[Estimate, ...] = first.estimates
     if state.effects:
         final_estimates, study, state = _estimates(study, state)
+        real = _told_apart_from_nothing(study, state, declared, final_estimates)
+        if real is not None:
+            steps.append(StepRecord((), _named_only_in(state, real), real.fitted.train, real.fitted.holdout))
+            final_estimates, study, state = _estimates(study, real)
     count = sum(len(m.parameters) for m in declared)
     verdict = _verdict(before, state)
     later = later_split(study, state.fitted, _column_limit(state.fitted)) if verdict == "unexplained" else None
@@ -550,6 +554,35 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
     values, found, _ = hold_unidentifiable(problem, fitted.values, found)
     fitted = judge(study, fitted.modifiers, values)
     return found, study, replace(state, fitted=fitted)
+
+
+def _told_apart_from_nothing(
+    study: Study, state: _State, declared: tuple[Modifier, ...], found: Sequence[Estimate]
+) -> _State | None:
+    """The model without effects whose amounts may all be nothing; None where there are none."""
+    column = sum(len(m.parameters) for m in declared)
+    kept, columns = [], list(range(column))
+    for i, effect in enumerate(state.effects):
+        size, kinds = len(effect.parameters), len(effect.kinds)
+        mains = zip(
+            found[column + effect.main : column + size : kinds], effect.neutral[effect.main :: kinds], strict=True
+        )
+        if not all(e.ci95[0] <= nothing <= e.ci95[1] for e, nothing in mains):
+            kept.append(i)
+            columns += range(column, column + size)
+        column += size
+    if len(kept) == len(state.effects) or not kept:
+        return None
+    effects = tuple(state.effects[i] for i in kept)
+    fitted = refit(study, (*declared, *effects), state.fitted.values[columns], polish=True)
+    if fitted.misfit > state.fitted.misfit + NEAR:
+        return None
+    return _State(fitted, effects, tuple(state.rivals[i] for i in kept))
+
+
+def _named_only_in(before: _State, after: _State) -> tuple[str, ...]:
+    gone = (e for e in before.effects if e not in after.effects)
+    return tuple(f"{e.name} at {', '.join(e.places)}" for e in gone)
 
 
 def _verdict(before: Fitted, state: _State) -> Verdict:

@@ -101,9 +101,9 @@ def posterior(
     """Draw the posterior of the parameters of a fit, each draw a real replay of the training data.
 
     At least two independent ensembles (emcee) start about the fit, wider than the posterior. Each proposal is the
-    end of a chain under the likelihood of the fit's linear model, accepted or rejected by a real replay
-    (`posterior.surrogate`), so the draws are exact whatever the linear model is worth; `Sample.surrogate` says how
-    often it was right. The likelihood counts correlated residuals and what the model lacks as the intervals of
+    end of a chain under a quadratic model of the residuals, accepted or rejected by a real replay
+    (`posterior.surrogate`), so the draws are exact whatever that model is worth; `Sample.surrogate` says how often
+    it was right. The likelihood counts correlated residuals and what the model lacks as the intervals of
     `fit` do (`posterior.likelihood`). Converged when every ensemble is 50 autocorrelation times long and R-hat over
     the ensembles is below 1.01.
 

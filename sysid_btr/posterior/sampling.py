@@ -119,7 +119,7 @@ class Convergence:
 
 @dataclass(frozen=True, eq=False)
 class SurrogateCheck:
-    """How good the linear model was that proposals were drawn from; the draws are exact whatever it says.
+    """How good the model of the residuals was that proposals were drawn from; the draws are exact whatever it says.
 
     Attributes
     ----------
@@ -192,8 +192,8 @@ def sample(
 
     Parameters
     ----------
-    problem : its loss is evaluated at every draw.
-    likelihood : what a loss says; its linear model makes the proposals.
+    problem : its residuals are modelled, and its loss is evaluated at every proposal.
+    likelihood : what a loss says.
     priors : one a parameter.
     settings : ensembles and convergence.
     rng, budget, journal, progress : as for an estimator; the same seed and journal give the same draws.
