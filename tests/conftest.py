@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from terminal import Answer, Cli
 
+from sysid_btr.cli import run
 from sysid_btr.io.log import Log, LogMeta
 
 GOOD_JOINTS = ("HeadYaw", "LKneePitch", "RKneePitch", "LHipRoll", "RHipRoll")
@@ -21,6 +23,20 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"recorded logs not found in {folder}; set SYSID_BTR_DATA to their folder")
     return folder
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
+    """Run a command line in this process; no traceback may reach the user."""
+
+    def call(*argv: object) -> Answer:
+        capsys.readouterr()
+        code = run([str(a) for a in argv])
+        text = capsys.readouterr()
+        assert "Traceback" not in text.err
+        return Answer(code, text.out, text.err)
+
+    return call
 
 
 def make_good_log(seed: int = 0, n: int = 800, period: float = 0.01) -> Log:

@@ -7,13 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
+from terminal import Cli
 
 from sysid_btr.cli import app, run
 from sysid_btr.config import StudyFile
@@ -38,28 +38,6 @@ PENDULUM = """
   <actuator><position name="hinge" joint="hinge" kp="8" kv="0.4"/></actuator>
 </mujoco>
 """
-
-
-@dataclass(frozen=True)
-class Answer:
-    code: int
-    out: str
-    err: str
-
-
-Cli = Callable[..., Answer]
-
-
-@pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
-    def call(*argv: object) -> Answer:
-        capsys.readouterr()
-        code = run([str(a) for a in argv])
-        text = capsys.readouterr()
-        assert "Traceback" not in text.err
-        return Answer(code, text.out, text.err)
-
-    return call
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,6 @@ from sysid_btr.estimators import (
     Termination,
     available,
     get_estimator,
-    registry,
 )
 from sysid_btr.estimators.derivative_free import ALGORITHMS, GLOBAL, LOCAL
 from sysid_btr.estimators.ga import _Genome
@@ -224,16 +223,16 @@ def test_installed_estimators_are_found(monkeypatch: pytest.MonkeyPatch) -> None
     class Entry:
         value = "elsewhere:Thing"
 
-        def __init__(self, loaded: object) -> None:
-            self.loaded = loaded
+        def __init__(self, name: str, loaded: object) -> None:
+            self.name, self.loaded = name, loaded
 
         def load(self) -> object:
             if isinstance(self.loaded, Exception):
                 raise self.loaded
             return self.loaded
 
-    found = {"other": Entry(CmaEs), "broken": Entry(ImportError("no torch"))}
-    monkeypatch.setattr(registry, "_installed", lambda: found)
+    found = [Entry("other", CmaEs), Entry("broken", ImportError("no torch"))]
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda *, group: found)
     assert get_estimator("other", sigma=0.1) == CmaEs(sigma=0.1)
     assert available()[-2:] == ("broken", "other")
     with pytest.raises(UsageError, match=r"'broken' is installed .* no torch"):

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from terminal import Cli
 
-from sysid_btr.cli import run
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators import Budget
 from sysid_btr.identify.fit import Fit, fit
@@ -140,28 +139,6 @@ def test_figures_are_drawn_on_axes(leg: Posterior) -> None:
 
 
 # --- the command line -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Answer:
-    code: int
-    out: str
-    err: str
-
-
-Cli = Callable[..., Answer]
-
-
-@pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
-    def call(*argv: object) -> Answer:
-        capsys.readouterr()
-        code = run([str(a) for a in argv])
-        text = capsys.readouterr()
-        assert "Traceback" not in text.err
-        return Answer(code, text.out, text.err)
-
-    return call
 
 
 ASKED = (

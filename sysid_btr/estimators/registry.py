@@ -14,6 +14,7 @@ from sysid_btr.estimators.derivative_free import LOCAL, NLopt
 from sysid_btr.estimators.ensemble import Ensemble
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.lsq import LeastSquares
+from sysid_btr.plugins import installed, load_installed
 
 ENTRY_POINTS = "sysid_btr.estimators"
 """Entry-point group; each entry is a factory: keyword settings to an `Estimator`.
@@ -36,7 +37,7 @@ _WITH_ARGUMENT = {"nlopt": LOCAL[0]}
 def available() -> tuple[str, ...]:
     """Names of the estimators installed; ``nlopt:ALGORITHM`` stands for all of NLopt's."""
     named = (f"{name}:{_WITH_ARGUMENT[name]}" if name in _WITH_ARGUMENT else name for name in BUILT_IN)
-    return (*named, *sorted(set(_installed()) - set(BUILT_IN)))
+    return (*named, *sorted(set(installed(ENTRY_POINTS)) - set(BUILT_IN)))
 
 
 def get_estimator(name: str, **settings: Any) -> Estimator:
@@ -58,7 +59,7 @@ def get_estimator(name: str, **settings: Any) -> Estimator:
     if "+" in name:
         return _chain(name, settings)
     stem, colon, argument = name.partition(":")
-    factory = BUILT_IN.get(stem) or _load(stem)
+    factory = BUILT_IN.get(stem) or load_installed(ENTRY_POINTS, stem, "estimator")
     if factory is None:
         raise UsageError(_unknown(name))
     if colon and stem in BUILT_IN and stem not in _WITH_ARGUMENT:
@@ -84,25 +85,6 @@ def _check_settings(name: str, factory: Factory, settings: Mapping[str, Any]) ->
     wrong = [key for key in settings if key not in known]
     if wrong:
         raise UsageError(f"estimator {name!r} has no setting {', '.join(wrong)}; it has {', '.join(known)}")
-
-
-def _installed() -> dict[str, Any]:
-    from importlib.metadata import entry_points
-
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
-
-
-def _load(name: str) -> Factory | None:
-    entry = _installed().get(name)
-    if entry is None:
-        return None
-    try:
-        factory: Factory = entry.load()
-    except Exception as error:
-        raise UsageError(
-            f"estimator {name!r} is installed ({entry.value}) but cannot be loaded: {error}"
-        ) from error
-    return factory
 
 
 def _unknown(name: str) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr.report.figures import DARK, LIGHT, MODEL_COLOURS
+from sysid_btr.report.figures import DARK, LIGHT, MODEL_COLOURS, page_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,23 +34,9 @@ def draw_btr(result: Mapping[str, Any], *, dark: bool = False, truth: Mapping[st
     theme = DARK if dark else LIGHT
     rounds = result["iterations"]
     names = list(dict.fromkeys(n for r in rounds for n in r["model"]))
-    style: Any = {
-        "font.size": 9,
-        "text.color": theme["ink"],
-        "axes.labelcolor": theme["ink"],
-        "axes.edgecolor": theme["faint"],
-        "axes.facecolor": theme["paper"],
-        "xtick.color": theme["faint"],
-        "ytick.color": theme["faint"],
-        "xtick.labelcolor": theme["ink"],
-        "ytick.labelcolor": theme["ink"],
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "legend.frameon": False,
-    }
     count = 2 + len(names)
     rows = -(-count // COLUMNS)
-    with rc_context(style):
+    with rc_context({**page_style(theme), "legend.frameon": False}):
         figure = Figure(figsize=(13, 0.4 + 2.8 * rows), layout="constrained", facecolor=theme["paper"])
         FigureCanvasAgg(figure)
         axes = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())

@@ -126,6 +126,23 @@ MODEL_COLOURS = ("#d1495b", "#edae49", "#2e9e6b")
 """Plain, parameters fitted, effects added; told apart also without red and green."""
 
 
+def page_style(theme: Mapping[str, str]) -> dict[Any, Any]:
+    """Matplotlib's settings for a page of a report."""
+    return {
+        "font.size": 9,
+        "text.color": theme["ink"],
+        "axes.labelcolor": theme["ink"],
+        "axes.edgecolor": theme["faint"],
+        "axes.facecolor": theme["paper"],
+        "xtick.color": theme["faint"],
+        "ytick.color": theme["faint"],
+        "xtick.labelcolor": theme["ink"],
+        "ytick.labelcolor": theme["ink"],
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+    }
+
+
 def draw_overlay(traces: Sequence[Trace], *, dark: bool = False) -> bytes:
     """PNG of the traces: whole log, a close-up of the held-out part, and the residual there.
 
@@ -139,21 +156,7 @@ def draw_overlay(traces: Sequence[Trace], *, dark: bool = False) -> bytes:
     from matplotlib.figure import Figure
 
     theme = DARK if dark else LIGHT
-    style: Any = {
-        "font.size": 9,
-        "text.color": theme["ink"],
-        "axes.labelcolor": theme["ink"],
-        "axes.edgecolor": theme["faint"],
-        "axes.facecolor": theme["paper"],
-        "xtick.color": theme["faint"],
-        "ytick.color": theme["faint"],
-        "xtick.labelcolor": theme["ink"],
-        "ytick.labelcolor": theme["ink"],
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "lines.linewidth": 1.1,
-    }
-    with rc_context(style):
+    with rc_context({**page_style(theme), "lines.linewidth": 1.1}):
         rows = max(len(traces), 1)
         figure = Figure(figsize=(13, 0.6 + 2.5 * rows), layout="constrained", facecolor=theme["paper"])
         FigureCanvasAgg(figure)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._file import looks_like
@@ -15,6 +14,7 @@ from sysid_btr.io.importers.naoqi import NaoQiImporter
 from sysid_btr.io.importers.plain_mcap import McapImporter
 from sysid_btr.io.importers.ros2 import Ros2Importer
 from sysid_btr.io.importers.table import first_bytes
+from sysid_btr.plugins import installed, load_installed
 
 ENTRY_POINTS = "sysid_btr.importers"
 """Entry-point group; each entry is a factory without arguments of an `Importer`."""
@@ -33,7 +33,7 @@ BUILT_IN: Mapping[str, Factory] = {
 
 def available() -> tuple[str, ...]:
     """Names of the importers installed."""
-    return (*BUILT_IN, *sorted(set(_installed()) - set(BUILT_IN)))
+    return (*BUILT_IN, *sorted(set(installed(ENTRY_POINTS)) - set(BUILT_IN)))
 
 
 def get_importer(name: str) -> Importer:
@@ -44,7 +44,7 @@ def get_importer(name: str) -> Importer:
     UsageError
         No such importer, or one that cannot be loaded.
     """
-    factory = BUILT_IN.get(name) or _load(name)
+    factory = BUILT_IN.get(name) or load_installed(ENTRY_POINTS, name, "format")
     if factory is None:
         from difflib import get_close_matches
 
@@ -65,7 +65,7 @@ def recognise(path: Path) -> Importer:
     if not path.exists():
         raise LogError(f"{path}: there is no such file or folder; looked in {path.parent.resolve()}")
     head = first_bytes(path)
-    for name in (*sorted(set(_installed()) - set(BUILT_IN)), *BUILT_IN):
+    for name in (*sorted(set(installed(ENTRY_POINTS)) - set(BUILT_IN)), *BUILT_IN):
         importer = get_importer(name)
         if importer.recognises(path, head):
             return importer
@@ -83,22 +83,3 @@ def _unrecognised(path: Path, head: bytes) -> str:
         return "the file has 0 bytes; record or copy it again"
     kind, remedy = looks_like(head)
     return f"it looks like {kind}, and no importer reads that; {remedy}. Formats: {', '.join(available())}"
-
-
-def _installed() -> dict[str, Any]:
-    from importlib.metadata import entry_points
-
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
-
-
-def _load(name: str) -> Factory | None:
-    entry = _installed().get(name)
-    if entry is None:
-        return None
-    try:
-        factory: Factory = entry.load()
-    except Exception as error:
-        raise UsageError(
-            f"format {name!r} is installed ({entry.value}) but cannot be loaded: {error}"
-        ) from error
-    return factory
