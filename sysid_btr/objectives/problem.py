@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from sysid_btr.objectives.marginal import Marginal, Projection, projections
 from sysid_btr.objectives.targets import Target
 from sysid_btr.replay.engine import Numerics, Replay
 from sysid_btr.replay.structure import colour, limbs, parameter_limbs
+from sysid_btr.replay.together import chunks_together, parties
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,22 +116,37 @@ class ReplayProblem:
         """Whitened residuals, (m, r), of candidates (m, p); NaN rows where a candidate diverged."""
         candidates = np.atleast_2d(candidates)
         result = np.empty((len(candidates), self.count))
-        column = 0
-        for episode in self.episodes:
-            width = int(sum(t.mask.sum() for t in episode.targets))
-            for rows, outputs in episode.replay.chunks(candidates):
-                result[rows, column : column + width] = episode.whitened(outputs)
-            column += width
+        for party in self._parties:
+            for rows, outputs in self._simulate(party, candidates):
+                for i, own in zip(party, outputs, strict=True):
+                    result[rows, self._columns_of[i]] = self.episodes[i].whitened(own)
         return result
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         """Sum of squared whitened residuals, (m,); NaN where a candidate diverged."""
         candidates = np.atleast_2d(candidates)
         total = np.zeros(len(candidates))
-        for episode in self.episodes:
-            for rows, outputs in episode.replay.chunks(candidates):
-                total[rows] += np.sum(episode.whitened(outputs) ** 2, axis=1)
+        for party in self._parties:
+            for rows, outputs in self._simulate(party, candidates):
+                for i, own in zip(party, outputs, strict=True):
+                    total[rows] += np.sum(self.episodes[i].whitened(own) ** 2, axis=1)
         return total
+
+    @cached_property
+    def _parties(self) -> list[tuple[int, ...]]:
+        """Episodes that are simulated together."""
+        return parties([e.replay for e in self.episodes])
+
+    def _simulate(
+        self, party: tuple[int, ...], candidates: FloatArray
+    ) -> Iterator[tuple[slice, tuple[Outputs, ...]]]:
+        return chunks_together([self.episodes[i].replay for i in party], candidates)
+
+    @cached_property
+    def _columns_of(self) -> list[slice]:
+        """Where each episode's residuals lie."""
+        ends = np.cumsum([0, *(int(sum(t.mask.sum() for t in e.targets)) for e in self.episodes)])
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     @cached_property
     def blocks(self) -> IntArray:

@@ -103,6 +103,11 @@ def make_targets(
                 mask=mask[:, live],
             )
         )
+    if not targets and log.is_motion:
+        raise ModelError(
+            f"log {log.path or ''} is a motion to be played, not a recording: it has commands alone, and nothing to "
+            "compare a replay with. Give the log of what the sensors said when it was played."
+        )
     if not targets:
         have = ", ".join(log.joints("position")) or "none"
         raise ModelError(

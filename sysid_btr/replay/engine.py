@@ -8,7 +8,7 @@ whatever the number of candidates and the length of the log.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -190,11 +190,37 @@ class Replay:
         grid: Grid,
     ) -> Outputs:
         """Simulate from the state that the batch is in, and read the sensors."""
+        states = self.integrate(rig, pairs, command, applied, grid, ((self.log, grid),))
+        return self.read(rig, slice(None), pairs, states, command, grid)
+
+    def integrate(
+        self,
+        rig: Rig,
+        pairs: list[tuple[Modifier, FloatArray]],
+        command: FloatArray,
+        applied: FloatArray | None,
+        grid: Grid,
+        logs: Sequence[tuple[Log, Grid]],
+    ) -> States:
+        """Simulate from the state that the batch is in; each of the logs owns an equal share of its rows."""
         laws = [(mod, val) for mod, val in pairs if type(mod).overrides("law")]
         run = self._roll_out if self.numerics.servo_period is None else self._hold_through
         if laws:
-            run = partial(self._step_through, laws=laws)
-        states = run(rig, command=command, applied=applied, grid=grid)
+            # what a servo does comes before what depends on it
+            laws.sort(key=lambda law: law[0].law_acts == ("friction",))
+            run = partial(self._step_through, laws=laws, inputs=inputs_of(logs, grid.steps, rig.size))
+        return run(rig, command=command, applied=applied, grid=grid)
+
+    def read(
+        self,
+        rig: Rig,
+        rows: slice,
+        pairs: list[tuple[Modifier, FloatArray]],
+        states: States,
+        command: FloatArray,
+        grid: Grid,
+    ) -> Outputs:
+        """Sensors in some rows of a batch; values, states and commands are of these rows."""
         position, velocity = at_samples(grid, states.position, states.velocity)
         effort = None
         if self.effort:
@@ -202,25 +228,25 @@ class Replay:
             effort = states.effort
             if effort is None:
                 steps = np.minimum(grid.state[grid.before], grid.steps - 1)
-                effort = servo_torque(rig, command[:, steps], motor, motor_velocity)
+                effort = servo_torque(rig, command[:, steps], motor, motor_velocity, rows)
             else:
                 effort = effort[:, grid.before]
         base = None if states.base is None else states.base[:, grid.before]
         outputs = Outputs(grid.sample_time, position, velocity, effort, base)
         for modifier, values in pairs:
             modifier.read_out(rig, values, outputs)
-        batch = rig.batch
-        bad = ~np.isfinite(outputs.position).all(axis=(1, 2)) | (batch.warning[:, :, 1].sum(axis=1) > 0)
+        warned = rig.batch.warning[rows, :, 1].sum(axis=1) > 0
+        bad = ~np.isfinite(outputs.position).all(axis=(1, 2)) | warned
         for array in (outputs.position, outputs.velocity, outputs.effort, outputs.base):
             if array is not None:
                 array[bad] = np.nan
         return outputs
 
-    def _roll_out(self, rig: Rig, command: FloatArray, applied: FloatArray | None, grid: Grid) -> _States:
+    def _roll_out(self, rig: Rig, command: FloatArray, applied: FloatArray | None, grid: Grid) -> States:
         import mujoco
 
         batch, index, keep = rig.batch, self.index, grid.state
-        states = _States.empty(rig.size, len(keep), index)
+        states = States.empty(rig.size, len(keep), index)
         states.store(batch, index, 0, grid)
         spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
         nu, nv = self.model.nu, self.model.nv
@@ -241,7 +267,7 @@ class Replay:
 
     def _hold_through(
         self, rig: Rig, command: FloatArray, applied: FloatArray | None, grid: Grid
-    ) -> _States:
+    ) -> States:
         """From one tick of digital servos to the next: their torque is computed at the tick and held."""
         batch, index, keep = rig.batch, self.index, grid.state
         drive = _Drive(rig)
@@ -272,7 +298,7 @@ class Replay:
             batch.step()
         records_q[:, -1], records_v[:, -1] = qpos, qvel
         drive.restore()
-        states = _States.empty(rig.size, len(keep), index)
+        states = States.empty(rig.size, len(keep), index)
         states.put(index, np.arange(len(keep)), records_q, records_v)
         return states
 
@@ -283,11 +309,12 @@ class Replay:
         command: FloatArray,
         applied: FloatArray | None,
         grid: Grid,
-    ) -> _States:
+        inputs: dict[str, FloatArray],
+    ) -> States:
         """Step by step, for laws that MuJoCo cannot hold; all candidates of the chunk at once."""
         batch, index = rig.batch, self.index
         h = grid.timestep
-        states = _States.empty(rig.size, len(grid.state), index, effort=self.effort)
+        states = States.empty(rig.size, len(grid.state), index, effort=self.effort)
         drive = _Drive(rig)
         memory = [
             (modifier, values, modifier.start_law(rig, values), law_index(index, modifier))
@@ -296,7 +323,6 @@ class Replay:
         acts = frozenset(name for modifier, _ in laws for name in modifier.law_acts)
         held_steps = self.numerics.held_steps
         held: FloatArray | None = None
-        inputs = step_inputs(self.log, grid)
         qpos_view, qvel_view, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         qfrc = batch.bind("qfrc_applied")
         previous = qvel_view[:, index.dof].copy()
@@ -329,7 +355,7 @@ class Replay:
 
 
 @dataclass
-class _States:
+class States:
     """States kept at step borders, (m, kept, joints)."""
 
     position: FloatArray
@@ -340,7 +366,7 @@ class _States:
     base: FloatArray | None = None
 
     @classmethod
-    def empty(cls, m: int, kept: int, index: Index, *, effort: bool = False) -> _States:
+    def empty(cls, m: int, kept: int, index: Index, *, effort: bool = False) -> States:
         def new() -> FloatArray:
             return np.empty((m, kept, len(index.joints)))
 
@@ -349,6 +375,19 @@ class _States:
         position, velocity = (new(), new()) if (index.link_qpos >= 0).any() else (motor, motor_velocity)
         base = np.empty((m, kept, 13)) if index.base is not None else None
         return cls(position, velocity, motor, motor_velocity, new() if effort else None, base)
+
+    def of(self, rows: slice) -> States:
+        """Those of some simulations."""
+        linked = self.position is not self.motor
+        motor, motor_velocity = self.motor[rows], self.motor_velocity[rows]
+        return States(
+            self.position[rows] if linked else motor,
+            self.velocity[rows] if linked else motor_velocity,
+            motor,
+            motor_velocity,
+            None if self.effort is None else self.effort[rows],
+            None if self.base is None else self.base[rows],
+        )
 
     def put(self, index: Index, slots: IntArray, qpos: FloatArray, qvel: FloatArray) -> None:
         self.motor[:, slots] = qpos[:, :, index.qpos]
@@ -464,8 +503,10 @@ class _Drive:
         self.forcerange[:, self.actuators] = np.where(finite[..., None], force, 0.0)
 
 
-def servo_torque(rig: Rig, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
-    """Joint torque of the servos by their own law, (m, samples, joints); zero where there is no servo.
+def servo_torque(
+    rig: Rig, command: FloatArray, qpos: FloatArray, qvel: FloatArray, rows: slice = slice(None)
+) -> FloatArray:
+    """Joint torque of the servos by their own law, (m, samples, joints), of some rows; zero without a servo.
 
     Computed here because MuJoCo's `actuator_force` lags the state by a substep.
     """
@@ -477,7 +518,7 @@ def servo_torque(rig: Rig, command: FloatArray, qpos: FloatArray, qvel: FloatArr
 
         def values(name: str, a: int = int(a)) -> Any:
             expanded = rig.batch.expanded(name)
-            array = getattr(model, name)[None] if expanded is None else expanded
+            array = getattr(model, name)[None] if expanded is None else expanded[rows]
             return array[:, a]
 
         gain, bias = values("actuator_gainprm"), values("actuator_biasprm")
@@ -573,6 +614,15 @@ def step_inputs(log: Log, grid: Grid) -> dict[str, FloatArray]:
         held = np.asarray(values, dtype=np.float64)[known[last], None]
         inputs[name] = mean_over_steps(grid.sample_time, held, grid.timestep, grid.steps)[:, 0]
     return inputs
+
+
+def inputs_of(logs: Sequence[tuple[Log, Grid]], steps: int, rows: int) -> dict[str, FloatArray]:
+    """Measured drive inputs, (steps, rows), of logs that each own an equal share of the rows."""
+    own = [step_inputs(log, replace(grid, command=np.empty((steps, 0)))) for log, grid in logs]
+    share = rows // len(logs)
+    return {
+        name: np.repeat(np.stack([inputs[name] for inputs in own], axis=1), share, axis=1) for name in own[0]
+    }
 
 
 def _setconst_inputs() -> Sequence[str]:

@@ -1,0 +1,165 @@
+"""Several logs under the same candidates in one batch: candidates times logs are its simulations.
+
+The cost of a step in Python, which laws need, is then shared among the logs; and a few candidates of many short logs
+fill all threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.models.modifier import Outputs, Rig
+from sysid_btr.replay.engine import CHUNK, CHUNK_DOFS, Replay, _setconst_inputs
+from sysid_btr.replay.grid import Grid
+from sysid_btr.replay.quiet import quiet
+
+if TYPE_CHECKING:
+    import mujoco
+
+ALIKE = 0.6
+"""Length of a log, as a fraction of the longest, from which it is worth simulating to the longest one's end."""
+
+
+def parties(replays: Sequence[Replay]) -> list[tuple[int, ...]]:
+    """Positions of the replays that can be simulated together, longest first in each party."""
+    order = sorted(range(len(replays)), key=lambda i: -replays[i].grid.steps)
+    found: list[list[int]] = []
+    for i in order:
+        for party in found:
+            first = replays[party[0]]
+            if replays[i].grid.steps >= ALIKE * first.grid.steps and _joinable(first, replays[i]):
+                party.append(i)
+                break
+        else:
+            found.append([i])
+    return sorted(tuple(party) for party in found)
+
+
+def chunks_together(
+    replays: Sequence[Replay], candidates: FloatArray
+) -> Iterator[tuple[slice, tuple[Outputs, ...]]]:
+    """Predicted sensors of all replays of a party, a chunk of candidates at a time.
+
+    Parameters
+    ----------
+    replays : that `parties` says can be simulated together.
+    candidates : (m, parameters).
+
+    Yields
+    ------
+    (slice, tuple of Outputs)
+        Rows of the chunk, and the sensors of every replay in turn; a diverged candidate is all NaN.
+    """
+    if len(replays) == 1:
+        for rows, outputs in replays[0].chunks(candidates):
+            yield rows, (outputs,)
+        return
+    candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
+    size = max(max(CHUNK, CHUNK_DOFS // max(replays[0].model.nv, 1)) // len(replays), 1)
+    for first in range(0, len(candidates), size):
+        rows = slice(first, min(first + size, len(candidates)))
+        with quiet():
+            outputs = _run(replays, candidates[rows])
+        yield rows, outputs
+
+
+def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ...]:
+    from mujoco.batch import Batch
+
+    lead, m = replays[0], len(candidates)
+    logs = len(replays)
+    batch = Batch(lead.model, m * logs, lead.threads)
+    rig = Rig(lead.model, batch, lead.index, lead.numerics.timestep)
+    shares = [slice(i * m, (i + 1) * m) for i in range(logs)]
+    for name in sorted({n for r in replays[1:] for n in _different(lead.model, r.model) or ()}):
+        array = rig.array(name)
+        for share, replay in zip(shares, replays, strict=True):
+            array[share] = getattr(replay.model, name)
+    values_of = lead._values(candidates)
+    pairs = [(modifier, np.tile(values, (logs, 1, 1))) for modifier, values in values_of]
+    for modifier, values in pairs:
+        modifier.write_fields(rig, values)
+    if rig.touched & set(_setconst_inputs()):
+        batch.set_const()
+    grids = [replay.grid for replay in replays]
+    steps = max(grid.steps for grid in grids)
+    index, h = lead.index, lead.numerics.timestep
+    qpos = np.repeat(np.stack([r.start[0] for r in replays]), m, axis=0)
+    qvel = np.repeat(np.stack([r.start[1] for r in replays]), m, axis=0)
+    last = np.minimum(np.arange(steps), np.array([[g.steps - 1] for g in grids]))
+    command = np.repeat(np.stack([g.command[k] for g, k in zip(grids, last, strict=True)]), m, axis=0)
+    applied: FloatArray | None = None
+    border_time = h * np.arange(steps + 1, dtype=np.float64)
+    for modifier, values in pairs:
+        modifier.initial_state(rig, values, qpos, qvel)
+        command = modifier.shape_command(rig, values, command)
+        torque = modifier.applied_torque(rig, values, border_time)
+        if torque is not None:
+            applied = torque if applied is None else applied + torque
+    batch.bind("qpos")[:, index.qpos] = qpos
+    batch.bind("qvel")[:, index.dof] = qvel
+    # borders that any of the logs wants to see
+    state = np.unique(np.concatenate([grid.state for grid in grids]))
+    whole = Grid(h, np.empty((steps, 0)), grids[0].sample_time, state, state, state, np.zeros(0))
+    states = lead.integrate(
+        rig, pairs, command, applied, whole, [(r.log, g) for r, g in zip(replays, grids, strict=True)]
+    )
+    result = []
+    for share, replay, grid in zip(shares, replays, grids, strict=True):
+        seat = np.searchsorted(state, grid.state)
+        own = replace(grid, state=state, before=seat[grid.before], after=seat[grid.after])
+        result.append(
+            replay.read(
+                rig, share, values_of, states.of(share), command[share, : grid.steps], own
+            )
+        )
+    return tuple(result)
+
+
+def _joinable(a: Replay, b: Replay) -> bool:
+    """Whether two replays differ only in their logs and in numbers of their models."""
+    if type(a) is not Replay or type(b) is not Replay:
+        return False
+    same = (
+        a.modifiers == b.modifiers
+        and a.robot.always == b.robot.always
+        and a.numerics == b.numerics
+        and a.effort == b.effort
+        and a.threads == b.threads
+        and a.log.meta.mount == b.log.meta.mount
+        and _input_names(a) == _input_names(b)
+    )
+    return same and _different(a.model, b.model) is not None
+
+
+def _input_names(replay: Replay) -> frozenset[str]:
+    return frozenset(n for n in replay.log.channels if n.split(".")[0] in ("voltage", "enabled"))
+
+
+def _different(a: mujoco.MjModel, b: mujoco.MjModel) -> frozenset[str] | None:
+    """Fields in which two models differ; None if they differ in what one batch cannot hold."""
+    from mujoco.batch import MODEL_FIELDS
+
+    if not np.array_equal(_values(a.opt), _values(b.opt)) or a.names != b.names:
+        return None
+    found = set()
+    for name in (n for n in dir(a) if not n.startswith("_")):
+        x, y = getattr(a, name), getattr(b, name)
+        if isinstance(x, int) and name.startswith("n") and x != y:
+            return None
+        if isinstance(x, np.ndarray) and not np.array_equal(x, y, equal_nan=x.dtype.kind == "f"):
+            if name not in MODEL_FIELDS:
+                return None
+            found.add(name)
+    return frozenset(found)
+
+
+def _values(options: mujoco.MjOption) -> FloatArray:
+    """All numbers of MuJoCo's options."""
+    names = (n for n in dir(options) if not n.startswith("_"))
+    return np.concatenate([np.atleast_1d(np.asarray(getattr(options, n), dtype=np.float64)) for n in names])
