@@ -38,6 +38,7 @@ from sysid_btr.replay.engine import Numerics, Replay
 from sysid_btr.replay.grid import ALIGNED, make_grid, mean_over_steps
 from sysid_btr.replay.numerics import choose_numerics
 from sysid_btr.replay.start import initial_state
+from sysid_btr.replay.together import chunks_together, parties
 
 ARM = ("arm",)
 ZERO = np.zeros(1)
@@ -437,3 +438,66 @@ def test_a_held_torque_does_not_depend_on_the_step_of_the_plant() -> None:
     assert np.abs(position(0.002) - position(0.001)).max() < 1e-6
     longer = Replay(leg(), LEG_LOG, (), Numerics("RK4", 0.002, 0.002)).predict(np.zeros((1, 0))).position
     assert np.abs(position(0.002) - longer).max() > 1e-5
+
+
+# --- several logs together --------------------------------------------------------------------------------
+
+
+def _stiffer(factor: float) -> Any:
+    def edit(spec: Any) -> None:
+        for actuator in spec.actuators:
+            actuator.gainprm[0] *= factor
+            actuator.biasprm[1] *= factor
+
+    return edit
+
+
+@pytest.mark.parametrize("law", [False, True])
+def test_logs_simulated_together_move_as_each_does_alone(law: bool) -> None:
+    """Of different lengths and clocks, and of robots that differ in numbers."""
+    rng = np.random.default_rng(3)
+    irregular = np.cumsum(rng.uniform(0.004, 0.013, 200))
+    logs = [
+        swing(LEG_JOINTS, seconds=2.0),
+        swing(LEG_JOINTS, seconds=1.5, size=0.3),
+        swing(LEG_JOINTS, seconds=0.4),
+        make_log(irregular, {f"command.{j}": np.round(np.sin(3 * irregular), 1) for j in LEG_JOINTS}),
+    ]
+    robots = [leg(), with_spec(leg(), _stiffer(1.5)), leg(), leg()]
+    effect = StribeckFriction(("knee",)) if law else CoulombFriction(("knee",))
+    modifiers = (*parse_parameters(["mass:knee", "delay:hip"], leg()), effect)
+    replays = [
+        Replay(r, log, modifiers, Numerics("RK4", 0.0025), effort=True)
+        for r, log in zip(robots, logs, strict=True)
+    ]
+    found = parties(replays)
+    assert sorted(i for party in found for i in party) == [0, 1, 2, 3]
+    assert max(len(party) for party in found) == 3, "the short one is not dragged along"
+    candidates = np.tile([p.nominal for p in replays[0].parameters], (5, 1))
+    candidates += rng.uniform(0, 0.02, candidates.shape)
+    for party in found:
+        for rows, together in chunks_together([replays[i] for i in party], candidates):
+            for i, outputs in zip(party, together, strict=True):
+                alone = replays[i].predict(candidates[rows])
+                for name in ("position", "velocity", "effort"):
+                    np.testing.assert_array_equal(getattr(outputs, name), getattr(alone, name), err_msg=name)
+
+
+def test_logs_of_robots_of_another_structure_are_simulated_apart() -> None:
+    log = swing(seconds=0.5)
+    other = robot_from_xml(
+        "<mujoco><worldbody><body name='arm'><joint name='arm' axis='0 1 0'/><geom size='.1' mass='1'/>"
+        "<body name='more'><joint name='more' axis='0 1 0'/><geom size='.1' mass='1'/></body></body></worldbody>"
+        "<actuator><position name='arm' joint='arm' kp='5'/></actuator></mujoco>"
+    )
+    slow, fast = Numerics("RK4", 0.005), Numerics("RK4", 0.0025)
+    replays = [Replay(r, log, (), n) for r, n in ((pendulum(), slow), (other, slow), (pendulum(), fast))]
+    assert parties(replays) == [(0,), (1,), (2,)]
+
+
+def test_a_candidate_that_diverges_in_one_log_does_not_spoil_the_others() -> None:
+    wild = make_log(np.arange(101) * 0.01, {"command.arm": np.full(101, 1e9)})
+    replays = [Replay(pendulum(), log, (), Numerics("RK4", 0.005)) for log in (swing(seconds=1.0), wild)]
+    ((_, (calm, thrown)),) = chunks_together(replays, np.zeros((1, 0)))
+    assert np.isnan(thrown.position).all()
+    assert np.isfinite(calm.position).all()

@@ -324,7 +324,7 @@ class Replay:
         held_steps = self.numerics.held_steps
         held: FloatArray | None = None
         qpos_view, qvel_view, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
-        qfrc = batch.bind("qfrc_applied")
+        qfrc, bias = batch.bind("qfrc_applied"), batch.bind("qfrc_bias")
         previous = qvel_view[:, index.dof].copy()
         slot = 0
         for k in range(grid.steps):
@@ -337,6 +337,7 @@ class Replay:
             previous = v.copy()
             step = drive.begin(k * h + 0.5 * h, h, command[:, k], q_mid, v_mid)
             step.inputs = {name: values[k] for name, values in inputs.items()}
+            step.load = bias[:, index.dof]
             for modifier, values, state, places in memory:
                 modifier.law(step, values, state, places)
             if held_steps and k % held_steps == 0:
@@ -349,8 +350,7 @@ class Replay:
             qfrc[:, index.dof] = joint_torque
             batch.step()
         states.store(batch, index, len(grid.state) - 1, grid)
-        if states.effort is not None:
-            states.effort[:, -1] = states.effort[:, -2]
+        states.repeat_last_effort()
         return states
 
 
@@ -376,18 +376,23 @@ class States:
         base = np.empty((m, kept, 13)) if index.base is not None else None
         return cls(position, velocity, motor, motor_velocity, new() if effort else None, base)
 
-    def of(self, rows: slice) -> States:
-        """Those of some simulations."""
+    def of(self, rows: slice, slots: IntArray) -> States:
+        """Those of some simulations at some of the borders."""
         linked = self.position is not self.motor
-        motor, motor_velocity = self.motor[rows], self.motor_velocity[rows]
+        motor, motor_velocity = self.motor[rows][:, slots], self.motor_velocity[rows][:, slots]
         return States(
-            self.position[rows] if linked else motor,
-            self.velocity[rows] if linked else motor_velocity,
+            self.position[rows][:, slots] if linked else motor,
+            self.velocity[rows][:, slots] if linked else motor_velocity,
             motor,
             motor_velocity,
-            None if self.effort is None else self.effort[rows],
-            None if self.base is None else self.base[rows],
+            None if self.effort is None else self.effort[rows][:, slots],
+            None if self.base is None else self.base[rows][:, slots],
         )
+
+    def repeat_last_effort(self) -> None:
+        """No step begins at the last border: the servos are taken to do there what they did before."""
+        if self.effort is not None:
+            self.effort[:, -1] = self.effort[:, -2]
 
     def put(self, index: Index, slots: IntArray, qpos: FloatArray, qvel: FloatArray) -> None:
         self.motor[:, slots] = qpos[:, :, index.qpos]
@@ -450,6 +455,7 @@ class _Drive:
             limit_low=low,
             limit_high=high,
             inputs={},
+            load=np.zeros(shape),
         )
 
     def _servo(self, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:

@@ -7,7 +7,6 @@ fill all threads.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,8 +55,8 @@ def chunks_together(
         Rows of the chunk, and the sensors of every replay in turn; a diverged candidate is all NaN.
     """
     if len(replays) == 1:
-        for rows, outputs in replays[0].chunks(candidates):
-            yield rows, (outputs,)
+        for rows, alone in replays[0].chunks(candidates):
+            yield rows, (alone,)
         return
     candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
     size = max(max(CHUNK, CHUNK_DOFS // max(replays[0].model.nv, 1)) // len(replays), 1)
@@ -111,13 +110,9 @@ def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ..
     )
     result = []
     for share, replay, grid in zip(shares, replays, grids, strict=True):
-        seat = np.searchsorted(state, grid.state)
-        own = replace(grid, state=state, before=seat[grid.before], after=seat[grid.after])
-        result.append(
-            replay.read(
-                rig, share, values_of, states.of(share), command[share, : grid.steps], own
-            )
-        )
+        own = states.of(share, np.searchsorted(state, grid.state))
+        own.repeat_last_effort()
+        result.append(replay.read(rig, share, values_of, own, command[share, : grid.steps], grid))
     return tuple(result)
 
 
