@@ -33,6 +33,7 @@ from toys import (
 )
 
 from sysid_btr.effects.armature import Armature
+from sysid_btr.effects.back_emf import BackEmf
 from sysid_btr.effects.backlash import Backlash, BacklashMotor
 from sysid_btr.effects.base import Effect
 from sysid_btr.effects.cogging import Cogging
@@ -49,7 +50,12 @@ from sysid_btr.effects.gravity_tilt import GravityTilt
 from sysid_btr.effects.integral_gain import IntegralGain
 from sysid_btr.effects.joint_compliance import JointCompliance, JointComplianceMotor
 from sysid_btr.effects.joint_spring import JointSpring
-from sysid_btr.effects.load_friction import LoadFriction
+from sysid_btr.effects.load_friction import (
+    LoadFriction,
+    LoadFrictionLarger,
+    LoadFrictionQuadratic,
+    LoadFrictionStribeck,
+)
 from sysid_btr.effects.payload import Payload
 from sysid_btr.effects.quadratic_damping import QuadraticDamping
 from sysid_btr.effects.sensor_delay import SensorDelay
@@ -315,6 +321,62 @@ def test_load_friction_holds_what_the_load_presses() -> None:
     assert rest(LoadFriction, [0.0]) == pytest.approx(
         solve(lambda q: KP * (COMMAND - q) - gravity(q)), abs=1e-9
     )
+
+
+def test_friction_of_the_larger_load_holds_more_where_the_weight_is_the_larger() -> None:
+    """A servo that asks for less than the weight: the friction follows the weight."""
+    rate = 0.3
+    q = rest(LoadFrictionLarger, [rate])
+    servo = KP * (COMMAND - q)
+    assert 0.02 < abs(servo - gravity(q)) <= rate * max(abs(servo), abs(gravity(q))) * 1.001
+    # let go of a weight that is held up: with no torque of the servo only the larger one has a say
+    loose_arm = with_spec(pendulum(), lambda spec: spec.delete(spec.actuators[0]))
+    start = parse_parameters(["qpos0:arm"], loose_arm)
+    log = make_log(np.arange(101) * 0.01, {"position.arm": np.full(101, 0.4)})
+    fallen = {
+        kind: run(loose_arm, log, [*start, at_arm(kind)], [0.0, 0.9], FINE).position[0]
+        for kind in (LoadFriction, LoadFrictionLarger)
+    }
+    free = run(loose_arm, log, start, [0.0], FINE).position[0]
+    np.testing.assert_allclose(fallen[LoadFriction], free, atol=1e-9)
+    assert np.abs(fallen[LoadFrictionLarger] - free).max() > 0.1
+
+
+def test_quadratic_load_friction_is_what_linear_is_at_one_load() -> None:
+    """Stuck at the servo's torque T, c T^2 holds as much as (c T) T."""
+    q = rest(LoadFrictionQuadratic, [0.2])
+    servo = KP * (COMMAND - q)
+    assert 0.02 < abs(servo - gravity(q)) <= 0.2 * servo**2 * 1.001
+
+
+def test_load_friction_that_falls_with_speed_is_plain_without_its_falling_part() -> None:
+    log = swing()
+    plain = position(pendulum(), log, [at_arm(LoadFriction)], [0.2])
+    same = position(pendulum(), log, [at_arm(LoadFrictionStribeck)], [0.2, 0.0, 0.3])
+    np.testing.assert_array_equal(plain, same)
+    slow = position(pendulum(), log, [at_arm(LoadFrictionStribeck)], [0.0, 0.2, 1e6])
+    np.testing.assert_allclose(slow, plain, atol=1e-9)
+
+
+def test_back_emf_damps_a_driven_joint_as_friction_does_and_a_released_one_not() -> None:
+    log = swing()
+    damped = position(pendulum(), log, [at_arm(ViscousDamping)], [0.05])
+    np.testing.assert_allclose(position(pendulum(), log, [at_arm(BackEmf)], [0.05]), damped, atol=2e-4)
+    assert np.abs(damped - position(pendulum(), log)).max() > 1e-2
+    released = make_log(log.time, {**log.channels, "enabled.arm": np.zeros(len(log.time))})
+    np.testing.assert_array_equal(
+        position(pendulum(), released, [at_arm(BackEmf)], [0.05]), position(pendulum(), log)
+    )
+
+
+def test_back_emf_moves_the_limits_of_the_torque_with_the_speed() -> None:
+    """At full drive a motor stops accelerating at its no-load speed."""
+    limited = robot_from_xml(
+        PENDULUM.replace(f'kv="{KV}"', 'kv="0" forcerange="-.3 .3"').replace(f"-{GRAVITY}", "0")
+    )
+    outputs = run(limited, held(1e3, 6.0), [at_arm(BackEmf)], [0.1], Numerics("RK4", 0.001))
+    damping = 0.1 + float(limited.compile().dof_damping[0])
+    assert outputs.velocity[0, -1, 0] == pytest.approx(0.3 / damping, rel=1e-3)
 
 
 # --- limits of the servo --------------------------------------------------------------------------------

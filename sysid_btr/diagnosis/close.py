@@ -43,7 +43,7 @@ REFIT_SECONDS = 20.0
 LADDER_SECONDS = 6.0
 """Part of each log on which it is decided where a refit begins, if there are more than ..."""
 FEW_STARTS = 12
-MAX_ROUNDS = 6
+MAX_ROUNDS = 10
 MAX_REFINEMENTS = 1
 """Times the step may be halved in the end."""
 REFITS = 7
@@ -551,7 +551,7 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
             break
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, fitted.modifiers, fitted.values, iterations=4))
-    values, found, _ = hold_unidentifiable(problem, fitted.values, found)
+    values, found, _ = hold_unidentifiable(problem, fitted.values, found, jacobian)
     fitted = judge(study, fitted.modifiers, values)
     return found, study, replace(state, fitted=fitted)
 

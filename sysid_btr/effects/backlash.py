@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 HELD = 1e-7
 
 
+ROTOR_SHARE = 0.02
+"""Inertia of a rotor that the model says nothing of, as a fraction of the joint's."""
+
+
 @dataclass(frozen=True)
 class Backlash(Effect):
     """Structure: a second joint on the link, stopped at +-play / 2; all damping of the joint on the link.
@@ -70,9 +74,13 @@ class BacklashMotor(Backlash):
 def add_link_joint(spec: mujoco.MjSpec, name: str, *, damping_on_link: bool) -> None:
     """Split a joint into a motor side (the joint itself) and a link side (a second one, same axis).
 
-    The rotor's inertia, friction and servo stay on the motor side.
+    The rotor's inertia, friction and servo stay on the motor side; a rotor that the model gives no inertia gets a
+    trace of the joint's, because a side without any cannot be simulated.
     """
     joint = spec.joint(name)
+    if joint.armature == 0:
+        plain = spec.copy().compile()
+        joint.armature = ROTOR_SHARE * float(plain.dof_M0[plain.joint(name).dofadr[0]])
     link = joint.parent.add_joint(name=name + LINK_SUFFIX, type=joint.type, axis=joint.axis, pos=joint.pos)
     link.damping = [0.0, 0.0, 0.0]
     link.armature = 0.0

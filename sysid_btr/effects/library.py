@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Sequence
 
 from sysid_btr.effects.armature import Armature
+from sysid_btr.effects.back_emf import BackEmf
 from sysid_btr.effects.backlash import Backlash, BacklashMotor
 from sysid_btr.effects.base import Effect
 from sysid_btr.effects.cogging import Cogging
@@ -26,7 +27,12 @@ from sysid_btr.effects.gravity_tilt import GravityTilt
 from sysid_btr.effects.integral_gain import IntegralGain
 from sysid_btr.effects.joint_compliance import JointCompliance, JointComplianceMotor
 from sysid_btr.effects.joint_spring import JointSpring
-from sysid_btr.effects.load_friction import LoadFriction
+from sysid_btr.effects.load_friction import (
+    LoadFriction,
+    LoadFrictionLarger,
+    LoadFrictionQuadratic,
+    LoadFrictionStribeck,
+)
 from sysid_btr.effects.payload import Payload
 from sysid_btr.effects.quadratic_damping import QuadraticDamping
 from sysid_btr.effects.sensor_delay import SensorDelay
@@ -45,6 +51,10 @@ EFFECTS: tuple[type[Effect], ...] = (
     QuadraticDamping,
     StribeckFriction,
     LoadFriction,
+    LoadFrictionLarger,
+    LoadFrictionQuadratic,
+    LoadFrictionStribeck,
+    BackEmf,
     Armature,
     CommandDelay,
     SensorDelay,

@@ -123,6 +123,21 @@ class Kv(FieldModifier):
 
 
 @dataclass(frozen=True)
+class TorqueConstant(FieldModifier):
+    """Torque that a servo makes, its gains and its limits alike, as a factor: motor constant over resistance."""
+
+    name: ClassVar[str] = "torque_constant"
+    scope: ClassVar[Scope] = "servo"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 3.0, 0.05),)
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        ids = _servos(rig, self.places)
+        rig.array("actuator_gainprm")[:, ids, 0] *= values[:, :, 0]
+        rig.array("actuator_biasprm")[:, ids, :3] *= values[:, :, :1]
+        rig.array("actuator_forcerange")[:, ids] *= values[:, :, :1]
+
+
+@dataclass(frozen=True)
 class Damping(FieldModifier):
     """Viscous damping of a joint."""
 
@@ -323,6 +338,7 @@ FIELDS: dict[str, type[FieldModifier]] = {
         Inertia,
         Kp,
         Kv,
+        TorqueConstant,
         Damping,
         QuadraticDamping,
         Frictionloss,

@@ -109,7 +109,8 @@ class Step:
     """What a law sees and adds to at one simulation step; arrays are (candidates, joints of the log).
 
     `qpos` and `qvel` are the motor side, extrapolated to the middle of the step, which makes a law that is
-    held over the step second-order accurate. `torque` is the plain servo's torque there.
+    held over the step second-order accurate. `torque` is the plain servo's torque there, `load` the torque by which
+    gravity and the motion of the links load the joint, as of the last step.
     Laws add to `motor_torque`, `joint_torque`, `friction`; multiply `gain`; narrow `limit`.
     """
 
@@ -126,6 +127,12 @@ class Step:
     limit_low: FloatArray
     limit_high: FloatArray
     inputs: dict[str, FloatArray]
+    load: FloatArray
+
+    @property
+    def drive(self) -> FloatArray:
+        """The servo's torque under what other laws have done to it so far."""
+        return np.clip(self.gain * self.torque + self.motor_torque, self.limit_low, self.limit_high)
 
 
 @dataclass
