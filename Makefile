@@ -9,9 +9,9 @@ FIND_PYTHON = for p in $(PYTHON) python3 python3.13 python3.12 python3.11 python
   && echo $$p && exit 0; done; \
   echo "no Python 3.11 or newer with venv: install one, or say make PYTHON=/path/to/python3" >&2; exit 1
 PYTEST_FLAGS ?= -n 2 --dist loadfile -q
-SOURCES := sysid_btr tests benchmarks sample_logs notebooks
+SOURCES := sysid_btr tests benchmarks sample_logs notebooks docs
 
-.PHONY: demo test lint types check notebooks dev format clean
+.PHONY: demo test lint types check notebooks docs dev format clean
 
 demo: $(VENV)/installed
 	$(BIN)/sysid-btr demo
@@ -32,12 +32,15 @@ check: $(VENV)/installed-dev
 notebooks: $(VENV)/installed-dev
 	$(BIN)/python -m pytest --nbmake -p no:warnings -q notebooks
 
+docs: $(VENV)/installed-dev
+	$(BIN)/python docs/build.py
+
 format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
 clean:
-	rm -rf $(VENV) demo_out dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo_out docs/html dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 $(VENV)/bin/python:
 	python=$$($(FIND_PYTHON)) && $$python -m venv $(VENV)

@@ -16,10 +16,13 @@ if TYPE_CHECKING:
     from sysid_btr.diagnosis.close import close
     from sysid_btr.identify.fit import fit
     from sysid_btr.identify.study import make_study
+    from sysid_btr.importing import import_log
     from sysid_btr.io.parquet import read_log, write_log
     from sysid_btr.io.validation import validate_file, validate_log
     from sysid_btr.models.robot import load_robot
+    from sysid_btr.posterior import posterior
     from sysid_btr.replay.log import replay_log
+    from sysid_btr.result import read_result
     from sysid_btr.session import save
 
 __version__ = "0.1.0"
@@ -27,9 +30,12 @@ __version__ = "0.1.0"
 _HOME = {
     "close": "sysid_btr.diagnosis.close",
     "fit": "sysid_btr.identify.fit",
+    "import_log": "sysid_btr.importing",
     "load_robot": "sysid_btr.models.robot",
     "make_study": "sysid_btr.identify.study",
+    "posterior": "sysid_btr.posterior",
     "read_log": "sysid_btr.io.parquet",
+    "read_result": "sysid_btr.result",
     "replay_log": "sysid_btr.replay.log",
     "save": "sysid_btr.session",
     "validate_file": "sysid_btr.io.validation",
@@ -40,9 +46,12 @@ _HOME = {
 __all__ = [
     "close",
     "fit",
+    "import_log",
     "load_robot",
     "make_study",
+    "posterior",
     "read_log",
+    "read_result",
     "replay_log",
     "save",
     "validate_file",
@@ -54,7 +63,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'sysid_btr' has no attribute {name!r}; it offers {', '.join(__all__)}")
-    value = getattr(import_module(_HOME[name]), name)
+    home = import_module(_HOME[name])
+    value = home if _HOME[name] == f"{__name__}.{name}" else getattr(home, name)
     globals()[name] = value
     return value
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -31,13 +32,16 @@ from sysid_btr.request import (
 from sysid_btr.session import Folder, Interrupted, ProgressLine, as_model, interruptible, write_all
 
 if TYPE_CHECKING:
+    from sysid_btr._typing import FloatArray
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.estimators.journal import Journal
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
+    from sysid_btr.io.log import Log
     from sysid_btr.models.modifier import Modifier
     from sysid_btr.models.robot import Robot
     from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.replay.engine import Numerics
 
     Job = Callable[[Study, ProgressLine], Fit | Closing | Posterior]
 
@@ -47,6 +51,8 @@ does not fit the log; 5 finished and written, but the fit did not converge or th
 parameters (some not identifiable beside others that are is a result: 0); 130 interrupted, journal kept.
 """
 DEMO_OUT = "demo_out"
+OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
+"""What the system says where something cannot be written."""
 
 app = typer.Typer(
     name="sysid-btr",
@@ -83,6 +89,10 @@ def run(argv: Sequence[str]) -> int:
     except Exception as error:
         if "--debug" in argv:
             raise
+        if isinstance(error, OSError) and error.errno in OF_THE_DISK:
+            where = f" {error.filename}" if error.filename else ""
+            remark(f"error: cannot write{where}: {error.strerror}; make room, or choose a folder you may write to")
+            return UsageError.exit_code
         remark(
             f"internal error: {type(error).__name__}: {error}\n"
             "This is a defect of sysid-btr, not of your data. Run the command again with --debug and report "
@@ -442,7 +452,10 @@ def replay(
     config: Config = None,
     debug: Debug = False,
 ) -> None:
-    """Give the log's commands to the model and compare its sensors with the log's; nothing is fitted."""
+    """Give the log's commands to the model and compare its sensors with the log's; nothing is fitted.
+
+    A motion that was not recorded yet (excite.parquet) is only played: where every joint goes, and the predicted log.
+    """
     from sysid_btr.identify.scores import score_problem
     from sysid_btr.identify.study import make_study
     from sysid_btr.objectives.targets import COMPARED
@@ -451,13 +464,16 @@ def replay(
 
     began = time.perf_counter()
     robot = find_robot(model, None)
-    logs = read_logs(log)
+    logs = read_logs(log, motions=True)
     parameters = dict(assignments("--set", set_))
     modifiers, values = set_parameters(robot, parameters)
     numerics = None
     if params is not None:
         modifiers, values, numerics = with_params(params, robot, modifiers, values)
     targets = replay_targets(out, logs, overwrite)
+    if any(one.is_motion for one in logs):
+        _rehearse(robot, logs, (modifiers, values), numerics, targets, overwrite, threads, as_json)
+        return
     study = make_study(robot, logs, holdout=logs, channels=COMPARED, numerics=numerics, threads=threads)
     scores = score_problem(study.train_problem(modifiers), values)
     for path, one in zip(targets, logs, strict=False):
@@ -905,7 +921,7 @@ def excite(
         except Interrupted:
             raise InterruptedRun(_interrupted(keeper, progress)) from None
     result = outcome.make_result(found, seed=seed)
-    outcome.write_all(keeper.folder, found, result)
+    remark(f"report: {outcome.write_all(keeper.folder, found, result)}")
     if as_json:
         _print_json(result)
     else:
@@ -929,15 +945,11 @@ def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="The --out folder of a finished run.")],
     debug: Debug = False,
 ) -> None:
-    """Write report.html again from result.json and overlay.png of a finished run."""
-    from sysid_btr.report.html import render
+    """Write report.html again from result.json and the pictures of a finished run of any verb."""
+    from sysid_btr.report.pictures import write_report
     from sysid_btr.result import read_result
-    from sysid_btr.session import OVERLAY, REPORT
 
-    result = read_result(folder)
-    overlay = folder / OVERLAY
-    page = render(result, overlay.read_bytes() if overlay.is_file() else None)
-    sys.stdout.write(f"{Folder(folder).write(REPORT, page)}\n")
+    sys.stdout.write(f"{write_report(Folder(folder), read_result(folder))}\n")
 
 
 @app.command()
@@ -1023,12 +1035,50 @@ def _closing_job(
     return job
 
 
+def _rehearse(
+    robot: Robot,
+    motions: Sequence[Log],
+    chosen: tuple[tuple[Modifier, ...], FloatArray],
+    numerics: Numerics | None,
+    targets: Sequence[Path],
+    overwrite: bool,
+    threads: int,
+    as_json: bool,
+) -> None:
+    """Play motions in the model; say how far every joint goes."""
+    from itertools import zip_longest
+
+    from sysid_btr.io.parquet import write_log
+    from sysid_btr.replay.log import replay_log
+    from sysid_btr.report.motion import reach, reach_table
+    from sysid_btr.report.text import console
+
+    if not all(one.is_motion for one in motions):
+        raise UsageError("--log: motions to be played and recordings; give one or the other")
+    found = {}
+    for path, one in zip_longest(targets, motions):
+        predicted = replay_log(robot, one, chosen, numerics=numerics, threads=threads)
+        found[str(one.path)] = reach(robot, one, predicted)
+        if path is not None:
+            write_log(predicted, path, overwrite=overwrite)
+    if as_json:
+        _print_json(found)
+    else:
+        screen = console(sys.stdout)
+        for name, joints in found.items():
+            screen.print(f"{name}: a motion that was not recorded: played in the model, with nothing to compare")
+            screen.print(reach_table(joints))
+    for path in targets:
+        remark(f"predicted log: {path}")
+
+
 def _check_render(wanted: bool, keeper: Keeper) -> None:
     if wanted and keeper.folder is None:
         raise UsageError("--render writes pictures: give an --out folder for them")
 
 
-def _draw(folder: Folder, outcome: Fit | Closing) -> None:
+def _draw(folder: Folder, outcome: Fit | Closing, result: dict[str, Any]) -> None:
+    from sysid_btr.report.pictures import rewrite
     from sysid_btr.report.render import CannotRenderError, save_pictures
 
     try:
@@ -1040,6 +1090,7 @@ def _draw(folder: Folder, outcome: Fit | Closing) -> None:
         )
         return
     remark(f"pictures: {', '.join(map(str, pictures))}")
+    rewrite(folder, result, pictures[0].name)
 
 
 def _finish(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool = False) -> None:
@@ -1064,7 +1115,7 @@ def _run(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool
         page = write_all(keeper.folder, outcome, result)
         remark(f"report: {page}")
         if render:
-            _draw(keeper.folder, as_model(outcome))
+            _draw(keeper.folder, as_model(outcome), result)
     else:
         describe_model(as_model(outcome), result)
     if as_json:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from sysid_btr.errors import UsageError
+
+MAPPING = frozenset({"columns", "meta", "table", "time", "units"})
+"""Sections that the mapping file of an import has, and a study file has not."""
 
 
 class StudyFile(BaseModel):
@@ -146,11 +150,44 @@ def read_study_file(path: Path) -> dict[str, Any]:
     try:
         study = StudyFile.model_validate({key.replace("-", "_"): value for key, value in content.items()})
     except ValidationError as error:
-        known = ", ".join(f.alias or name for name, f in StudyFile.model_fields.items())
-        lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
-        listing = "\n".join(dict.fromkeys(lines))
-        raise UsageError(f"--config {path}:\n{listing}\nknown keys: {known}") from error
+        known = [f.alias or name for name, f in StudyFile.model_fields.items()]
+        listing = "\n".join(dict.fromkeys(f"  {_in_words(e, content, known)}" for e in error.errors()))
+        sections = ", ".join(sorted(MAPPING & set(content)))
+        if sections:
+            raise UsageError(
+                f"--config {path} is a mapping for `sysid-btr import` (it has {sections}): give it with --map; "
+                "`sysid-btr init LOG --model M` writes a study file"
+            ) from error
+        raise UsageError(f"--config {path}:\n{listing}\nkeys of a study file: {', '.join(known)}") from error
     return study.flags(path.parent)
+
+
+def _in_words(error: Any, content: dict[str, Any], known: list[str]) -> str:
+    """One finding of the validation."""
+    key = str(error["loc"][0])
+    if error["type"] == "extra_forbidden":
+        close = difflib.get_close_matches(key, known, n=1)
+        return f"{key}: no such key{f'; did you mean {close[0]}?' if close else ''}"
+    given = content.get(key, content.get(key.replace("_", "-")))
+    # a part of the place only says which alternative of a type was tried
+    inner = [str(part) for part in error["loc"][1:] if isinstance(given, dict) and part in given]
+    allowed = str(StudyFile.model_fields.get(key, StudyFile.model_fields["json_"]).annotation)
+    wanted = next((words for kind, words in KINDS if kind in allowed), "true or false")
+    return f"{'.'.join([key, *inner])}: {given!r} is not allowed; expected {wanted}"
+
+
+KINDS = (
+    ("tuple[float", "a table of name = [low, high]"),
+    ("dict[str, float]", "a table of name = number"),
+    ("dict[str, str]", "a table of name = text"),
+    ("float | str | list", "a fraction, a file or a list of files"),
+    ("list[str]", "text or a list of texts"),
+    ("bool", "true or false"),
+    ("int", "a whole number"),
+    ("float", "a number"),
+    ("str", "text"),
+)
+"""Type of a key -> what may be written there."""
 
 
 def _two_numbers(value: Any) -> bool:

@@ -117,19 +117,30 @@ def find_robot(name: str | None, bounds: list[str] | None) -> Robot:
         raise UsageError(f"which robot? Give --model: a built-in name{built_in} or an MJCF or URDF file")
     robot = load_robot(name)
     table = dict(bounds_table(bounds))
+    _check_names(robot, table)
     return replace(robot, bounds={**robot.bounds, **table}) if table else robot
 
 
-def read_logs(paths: Iterable[Path] | None) -> list[Log]:
-    """All logs, or one error that lists what is wrong with each of them."""
+def read_logs(paths: Iterable[Path] | None, *, motions: bool = False) -> list[Log]:
+    """All logs, or one error that lists what is wrong with each of them.
+
+    A motion that nobody has recorded yet counts as wrong, unless `motions` are wanted.
+    """
     from sysid_btr.io.parquet import read_log
 
     logs, problems = [], []
     for path in paths or ():
         try:
-            logs.append(read_log(path))
+            log = read_log(path)
         except LogError as error:
             problems.append(str(error))
+            continue
+        if log.is_motion and not motions:
+            problems.append(
+                f"{path} is a motion to be played, not a recording: play it on the robot, and give the log of what its "
+                "sensors said"
+            )
+        logs.append(log)
     if problems:
         raise LogError("\n".join(problems))
     if not logs:
@@ -143,7 +154,7 @@ def _warn(robot: Robot, log: Log) -> None:
     from sysid_btr.models.robot import joint_names, joint_ranges
 
     for problem in validate_log(log, joints=joint_names(robot), ranges=joint_ranges(robot)):
-        remark(f"warning: {log.path}: {problem.where}: {problem.message} [{problem.code}]")
+        remark(f"warning: {log.path}: {problem.where}: {problem.message} [{problem.code}]\n    -> {problem.remedy}")
 
 
 def _holdout(given: list[str] | None) -> float | list[Log]:
@@ -303,6 +314,20 @@ def bounds_table(given: list[str] | None) -> list[tuple[str, tuple[float, float]
     return pairs
 
 
+def _check_names(robot: Robot, bounds: Iterable[str]) -> None:
+    """Refuse bounds of what no parameter of the robot is called."""
+    from sysid_btr.models.grammar import check_expression
+
+    problems = []
+    for name in bounds:
+        try:
+            check_expression(name, robot)
+        except UsageError as error:
+            problems.append(f"--bounds {name}: {error}")
+    if problems:
+        raise UsageError("\n".join(problems))
+
+
 def number(text: str) -> float | None:
     """A finite number, or None."""
     try:
@@ -334,14 +359,14 @@ def replay_targets(out: Path | None, logs: Sequence[Log], overwrite: bool) -> li
     return targets
 
 
-def known_model(name: str | None) -> KnownModel | None:
-    """What an import wants to know of the robot called for, if one is."""
-    if name is None:
+def known_model(wanted: str | Robot | None) -> KnownModel | None:
+    """What an import wants to know of the robot called for by name or file, or given, if one is."""
+    if wanted is None:
         return None
     from sysid_btr.io.importers.run import KnownModel
     from sysid_btr.models.robot import joint_names, joint_ranges, load_robot
 
-    robot = load_robot(name)
+    robot = load_robot(wanted) if isinstance(wanted, str) else wanted
     model = robot.compile()
     joints = joint_names(robot)
     sliding = tuple(joint for joint in joints if int(model.joint(joint).type[0]) == 2)

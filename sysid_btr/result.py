@@ -421,9 +421,15 @@ def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise UsageError(
-            f"cannot read {file}: {error.strerror}; give the --out folder of a finished run"
-        ) from error
+        began = (file.parent / "journal.jsonl").exists() or (file.parent / "journals").is_dir()
+        todo = (
+            "the run in this folder has not ended: its command with --resume goes on with it"
+            if began
+            else "give the --out folder of a finished run"
+        )
+        raise UsageError(f"cannot read {file}: {error.strerror}; {todo}") from error
+    except UnicodeDecodeError:
+        raise UsageError(f"{file} is no result; give the --out folder of a finished run") from None
     except ValueError as error:
         raise UsageError(f"{file} is not JSON ({error}); give the result.json of a finished run") from error
     schema = content.get("schema") if isinstance(content, dict) else None

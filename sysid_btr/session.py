@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 import secrets
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TextIO
@@ -28,6 +26,7 @@ REPORT = "report.html"
 JOURNAL = "journal.jsonl"
 MODEL = "model.xml"
 PARAMS = "params.json"
+DRAWS = "posterior.nc"
 LINE_EVERY = 10.0
 """Seconds between progress lines where the terminal cannot redraw one."""
 
@@ -48,6 +47,21 @@ class Folder:
         """Names of what an earlier run left here."""
         return tuple(n for n in (RESULT, REPORT, OVERLAY, JOURNAL, MODEL, PARAMS) if (self.path / n).exists())
 
+    def within(self, name: str) -> Folder:
+        """A folder in this one, made if it is missing.
+
+        Raises
+        ------
+        UsageError
+            If it cannot be made.
+        """
+        inner = self.path / name
+        try:
+            inner.mkdir(exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"cannot make {inner}: {error.strerror}; choose another folder") from error
+        return Folder(inner)
+
     def write(self, name: str, content: str | bytes) -> Path:
         """Write one file, all or nothing.
 
@@ -66,7 +80,9 @@ class Folder:
                 os.fsync(file.fileno())
             part.replace(target)
         except OSError as error:
-            raise UsageError(f"cannot write {target}: {error.strerror}; choose another --out") from error
+            raise UsageError(
+                f"cannot write {target}: {error.strerror}; make room, or choose a folder that you may write to"
+            ) from error
         finally:
             part.unlink(missing_ok=True)
         return target
@@ -104,7 +120,10 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
         )
     if overwrite:
         for old in (folder.journal, *path.glob(f"{JOURNAL}.*.npy")):
-            old.unlink(missing_ok=True)
+            try:
+                old.unlink(missing_ok=True)
+            except OSError as error:
+                raise UsageError(f"--overwrite: cannot remove {old}: {error.strerror}; choose another --out") from error
     return folder
 
 
@@ -135,21 +154,20 @@ def save(
 def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[str, Any]) -> Path:
     """Write all files of a run; the result last, because its presence says that the run is complete.
 
-    The result is given what the model became.
+    The result is given what the model became, and what was drawn.
     """
-    from sysid_btr.report.figures import draw_overlay, trace_outcome
-    from sysid_btr.report.html import render
+    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.report.pictures import keep, pictures_of, write_report
     from sysid_btr.result import to_json
     from sysid_btr.writeback.write import describe_model
 
-    for name, content in _pictures(outcome).items():
-        folder.write(name, content())
-    outcome = as_model(outcome)
-    describe_model(outcome, result, folder)
-    traces = trace_outcome(outcome)
-    light, dark = draw_overlay(traces), draw_overlay(traces, dark=True)
-    folder.write(OVERLAY, light)
-    report = folder.write(REPORT, render(result, light, dark))
+    if isinstance(outcome, Posterior):
+        from sysid_btr.posterior.export import netcdf
+
+        folder.write(DRAWS, netcdf(outcome))
+    result["pictures"] = keep(folder, pictures_of(outcome))
+    describe_model(as_model(outcome), result, folder)
+    report = write_report(folder, result)
     folder.write(RESULT, to_json(result))
     return report
 
@@ -159,33 +177,6 @@ def as_model(outcome: Fit | Closing | Posterior) -> Fit | Closing:
     from sysid_btr.posterior.draw import Posterior
 
     return outcome.as_fit if isinstance(outcome, Posterior) else outcome
-
-
-def _pictures(outcome: Fit | Closing | Posterior) -> dict[str, Callable[[], bytes]]:
-    """Files that only some outcomes have."""
-    from sysid_btr.identify.fit import Fit
-    from sysid_btr.posterior.draw import Posterior
-
-    if isinstance(outcome, Posterior):
-        from sysid_btr.posterior.export import netcdf
-        from sysid_btr.report.posterior import bands_png, corner_png, trace_png
-
-        return {
-            "posterior.nc": partial(netcdf, outcome),
-            "corner.png": partial(corner_png, outcome),
-            "trace.png": partial(trace_png, outcome),
-            "predictive.png": partial(bands_png, outcome),
-        }
-    if isinstance(outcome, Fit) and outcome.profiles:
-        from sysid_btr.report.posterior import profile_png
-
-        return {f"profile_{file_name(p.name)}.png": partial(profile_png, p) for p in outcome.profiles}
-    return {}
-
-
-def file_name(parameter: str) -> str:
-    """A parameter's name as a part of a file's."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", parameter).strip("_")
 
 
 class Interrupted(BaseException):

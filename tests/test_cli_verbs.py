@@ -140,12 +140,12 @@ def test_the_start_does_not_change_the_answer(cli: Cli, asked: tuple[str, ...]) 
 def test_existing_results_are_refused_and_untouched(cli: Cli, asked: tuple[str, ...], tmp_path: Path) -> None:
     out = tmp_path / "o"
     assert cli("fit", *asked, "--fit", "mass:arm", "--out", out).code == 0
-    before = {f.name: f.read_bytes() for f in out.iterdir()}
+    before = {f: f.read_bytes() for f in out.rglob("*") if f.is_file()}
     answer = cli("fit", *asked, *FREE, "--out", out)
     assert answer.code == 2
     assert "--overwrite" in answer.err
     assert "--resume" in answer.err
-    assert {f.name: f.read_bytes() for f in out.iterdir()} == before
+    assert {f: f.read_bytes() for f in out.rglob("*") if f.is_file()} == before
     assert cli("fit", *asked, *FREE, "--out", out, "--overwrite").code == 0
     assert len(read_result(out)["parameters"]) == 2
 

@@ -128,7 +128,8 @@ def test_a_posterior_as_a_datatree(leg: Posterior) -> None:
 
 
 def test_figures_are_drawn_on_axes(leg: Posterior) -> None:
-    from sysid_btr.report.posterior import plot_bands, plot_corner, plot_trace, png
+    from sysid_btr.report.posterior import plot_bands, plot_corner, plot_trace
+    from sysid_btr.report.style import png
 
     count = len(leg.estimates)
     corner = plot_corner(leg)

@@ -19,7 +19,7 @@ from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.robot import load_robot
 from sysid_btr.replay.engine import Numerics
-from sysid_btr.report.html import render
+from sysid_btr.report.html import Picture, render
 from sysid_btr.report.text import console, show
 from sysid_btr.result import clean, exit_code, make_result, read_result, to_json
 from sysid_btr.units import si, si_all, with_digits_of
@@ -193,7 +193,7 @@ def test_exit_code_tells_a_finding_from_a_failure(study: Study) -> None:
 @pytest.mark.parametrize("verdict", ["explained", "nothing_missing", "ambiguous", "unexplained"])
 def test_the_report_holds_every_finding_and_escapes_names(study: Study, verdict: str) -> None:
     result = make_result(closing(study, verdict=verdict, message="a <b>bold</b> claim"))
-    page = render(result, b"light", b"dark")
+    page = render(result, [Picture("overlay", "how to read it", b"light", b"dark")])
     for text in ("mass:arm", "hardly any sensor responds", "coulomb_friction", "stribeck_friction"):
         assert text in page
     assert "<b>" not in page

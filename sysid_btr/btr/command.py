@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.request import remark, what_can_be_freed
-from sysid_btr.session import OVERLAY, REPORT, RESULT, Folder, Interrupted, ProgressLine, open_folder
+from sysid_btr.session import OVERLAY, RESULT, Folder, Interrupted, ProgressLine, open_folder
 
 if TYPE_CHECKING:
     from sysid_btr.btr.controllers import ControllerSpace
@@ -152,15 +152,15 @@ def run_btr(asked: Asked, out: Path | None, resume: bool, overwrite: bool) -> di
     return result
 
 
-def write_btr(folder: Folder, result: Mapping[str, Any]) -> None:
+def write_btr(folder: Folder, result: dict[str, Any]) -> None:
     """Write figures, report and, last, result.json."""
-    from sysid_btr.report.btr import draw_btr
-    from sysid_btr.report.html import render
+    from sysid_btr.report.btr import plot_btr
+    from sysid_btr.report.figures import figure_of
+    from sysid_btr.report.pictures import keep, write_report
     from sysid_btr.result import to_json
 
-    light, dark = draw_btr(result), draw_btr(result, dark=True)
-    folder.write(OVERLAY, light)
-    remark(f"report: {folder.write(REPORT, render(result, light, dark))}")
+    result["pictures"] = keep(folder, [(Path(OVERLAY).stem, lambda: figure_of(plot_btr(result)))])
+    remark(f"report: {write_report(folder, result)}")
     folder.write(RESULT, to_json(result))
 
 

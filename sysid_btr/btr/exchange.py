@@ -23,7 +23,7 @@ from sysid_btr.btr.controllers import Controller, ControllerSpace
 from sysid_btr.btr.robot import OUTCOMES, Trial
 from sysid_btr.btr.task import Walk
 from sysid_btr.errors import InterruptedRun, LogError, UsageError
-from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.log import MOTION, Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.problem import errors_of
 from sysid_btr.io.validation import validate_log
@@ -138,7 +138,7 @@ class FolderExchange:
             time=self.task.time,
             channels={f"command.{joint}": commands[:, i] for i, joint in enumerate(self.space.joints)},
             meta=LogMeta(
-                robot=self.robot, mount="free", sample_period=self.task.period, source="to be played", notes="commands"
+                robot=self.robot, mount="free", sample_period=self.task.period, source=MOTION
             ),
             episode=np.zeros(len(self.task.time), dtype=np.int64),
         )

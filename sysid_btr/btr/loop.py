@@ -192,6 +192,12 @@ class BackToReality:
     simulations: int
     seconds: float
 
+    def _repr_html_(self) -> str:
+        from sysid_btr.btr.result import btr_result
+        from sysid_btr.report.notebook import html_of_result
+
+        return html_of_result(btr_result(self))
+
     @property
     def tried(self) -> tuple[Tried, ...]:
         """All trials, in order."""

@@ -7,6 +7,7 @@ were finished before. Each record holds the candidates themselves, compared bit 
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -170,16 +171,28 @@ class Journal:
         return self._tape.cursor
 
     def append(self, record: Record, attachment: FloatArray | None = None) -> None:
-        """Add a finished evaluation. Only legal when nothing is left to replay."""
+        """Add a finished evaluation. Only legal when nothing is left to replay.
+
+        Raises
+        ------
+        UsageError
+            It cannot be written.
+        """
         if self._tape.cursor != len(self._tape.records):
             raise ValueError("a journal is appended to only after its last record was replayed")
         number = len(self._tape.records)
-        if attachment is not None:
-            # Written before its record: a record on disk never lacks its attachment.
-            self._save_attachment(number, attachment)
-        self._write(record.to_line(), sync=attachment is not None)
-        if attachment is not None:
-            self._drop_older_attachments(number)
+        try:
+            if attachment is not None:
+                # Written before its record: a record on disk never lacks its attachment.
+                self._save_attachment(number, attachment)
+            self._write(record.to_line(), sync=attachment is not None)
+            if attachment is not None:
+                self._drop_older_attachments(number)
+        except OSError as error:
+            raise UsageError(
+                f"{self._label} cannot be written: {error.strerror or 'no room is left'}. What was done before is kept "
+                "in it: make room or give leave to write there, and go on with --resume"
+            ) from error
         self._tape.records.append(record)
         self._tape.cursor = len(self._tape.records)
 
@@ -219,11 +232,14 @@ class Journal:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         target = self._attachment_path(self.path, number)
         partial = target.with_suffix(".part")
-        with partial.open("wb") as file:
-            np.save(file, values, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(target)
+        try:
+            with partial.open("wb") as file:
+                np.save(file, values, allow_pickle=False)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(target)
+        finally:
+            partial.unlink(missing_ok=True)
 
     def _drop_older_attachments(self, number: int) -> None:
         if self.path is None:
@@ -242,7 +258,8 @@ class Journal:
             header = {"journal": SCHEMA, "fingerprint": self.fingerprint}
             line = json.dumps(header).encode() + b"\n" + line
         with self.path.open("ab", buffering=0) as file:
-            file.write(line)
+            if file.write(line) != len(line):  # a disk that fills up takes a part without an error
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             if sync or time.monotonic() - self._tape.last_sync >= _SYNC_PERIOD:
                 os.fsync(file.fileno())
                 self._tape.last_sync = time.monotonic()

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log, LogMeta
     from sysid_btr.models.robot import Robot
 
-SOURCE = "designed motion"
 MARGIN = 0.05
 """Fraction of a joint's range that is left free at either end: servos overshoot."""
 VELOCITY = {False: 6.0, True: 0.3}
@@ -334,7 +333,7 @@ def as_log(
     times : repetitions, if not as many as the family's.
     like : metadata of a log of this robot, from which the servos' period and settings are taken.
     """
-    from sysid_btr.io.log import Log, LogMeta
+    from sysid_btr.io.log import MOTION, Log, LogMeta
     from sysid_btr.models.robot import servo_joints
 
     model = robot.compile()
@@ -350,7 +349,7 @@ def as_log(
         robot=like.robot,
         mount="fixed",
         sample_period=1 / family.clock.rate,
-        source=SOURCE,
+        source=MOTION,
         servo_period=like.servo_period,
         extra=like.extra,
     )

@@ -13,13 +13,16 @@ from sysid_btr.estimators.base import Termination
 from sysid_btr.result import SCHEMA, clean, estimate_entry, model_entry, to_json, versions
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
     from rich.console import RenderableType
 
     from sysid_btr.excite.design import Design
     from sysid_btr.identify.intervals import Estimate
     from sysid_btr.session import Folder
 
-MOTION, FIGURE = "excite.parquet", "excite.png"
+MOTION, FIGURE = "excite.parquet", "excite"
 MOTORS_SHOWN = 6
 WARNING = (
     "Only the limits of the joints keep this motion from hitting the robot itself or the ground: replay it in a viewer "
@@ -169,9 +172,9 @@ def show(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     )
 
 
-def draw(design: Design) -> bytes:
-    """PNG: the commands of the motors that move most, and the ratio of every interval to the reference's."""
-    from sysid_btr.report.posterior import FAINT, FITTED, INK, MODEL, new_figure, png
+def plot_motion(design: Design) -> Figure:
+    """The commands of the motors that move most, and the ratio of every interval to the reference's."""
+    from sysid_btr.report.style import FOUND, PLAIN, faint, ink, new_figure
 
     time, commands = design.family.commands(design.coefficients)
     motors = design.family.motors
@@ -182,9 +185,9 @@ def draw(design: Design) -> bytes:
     left, right = halves
     rows = left.subplots(len(order), 1, sharex=True, squeeze=False)[:, 0]
     for axis, i in zip(rows, order, strict=True):
-        axis.plot(time, commands[:, i], color=INK, lw=1)
+        axis.plot(time, commands[:, i], color=ink(), lw=1)
         for bound in (motors[i].low, motors[i].high):
-            axis.axhline(bound, color=FAINT, lw=0.8, ls="--")
+            axis.axhline(bound, color=faint(), lw=0.8, ls="--")
         axis.set_ylabel(motors[i].joints[0], rotation=0, ha="right", fontsize=8)
         axis.locator_params(axis="y", nbins=4)
     rows[0].set_title("commands (rad, m) and their bounds", fontsize=9)
@@ -192,22 +195,32 @@ def draw(design: Design) -> bytes:
     axis = right.subplots()
     place = np.arange(len(names))[::-1]
     ratios = np.where(design.told, design.ratios, np.nan)
-    axis.barh(place, ratios, color=[MODEL if r <= 1 else FITTED for r in np.nan_to_num(ratios)])
+    axis.barh(place, ratios, color=[FOUND if r <= 1 else PLAIN for r in np.nan_to_num(ratios)])
     for y, ratio in zip(place, ratios, strict=True):
         text = f" {ratio:.2f}" if np.isfinite(ratio) else " told by neither"
-        axis.text(ratio if np.isfinite(ratio) else 0.0, y, text, va="center", fontsize=8, color=INK)
-    axis.axvline(1.0, color=FAINT, lw=0.8)
+        axis.text(ratio if np.isfinite(ratio) else 0.0, y, text, va="center", fontsize=8, color=ink())
+    axis.axvline(1.0, color=faint(), lw=0.8)
     axis.set_yticks(place, names, fontsize=8)
+    axis.set_ylim(-0.7, len(names) - 0.3)
     axis.set_xlim(0, 1.15 * max(np.nanmax(ratios, initial=1.0), 1.0))
     axis.set_title(f"standard error over that of {design.compared_with}", fontsize=9)
-    return png(figure)
+    return figure
 
 
-def write_all(folder: Folder, design: Design, result: Mapping[str, Any]) -> None:
-    """Write motion, figure and result; the result last, because its presence says that the run is complete."""
+def write_all(folder: Folder, design: Design, result: dict[str, Any]) -> Path:
+    """Write motion, figure, report and result; the result last, because its presence says that the run is complete.
+
+    Returns
+    -------
+    Path
+        The report.
+    """
     from sysid_btr.io.parquet import write_log
+    from sysid_btr.report.pictures import keep, write_report
     from sysid_btr.session import RESULT
 
     write_log(design.log, folder.path / MOTION, overwrite=True)
-    folder.write(FIGURE, draw(design))
+    result["pictures"] = keep(folder, [(FIGURE, lambda: plot_motion(design))])
+    report = write_report(folder, result)
     folder.write(RESULT, to_json(result))
+    return report

@@ -112,9 +112,13 @@ def _rate(log: Log) -> Iterator[Problem]:
     if interval >= _SLOWEST_SAMPLE:
         exponent = 3 * round(np.log10(interval / (nominal or 0.01)) / 3)
         unit = {3: "milliseconds", 6: "microseconds", 9: "nanoseconds"}.get(
-            exponent, "another unit than seconds"
+            exponent, "some other unit"
         )
-        remedy = f"divide time by 1e{exponent}" if exponent in (3, 6, 9) else "write time in seconds"
+        remedy = (
+            f"divide time by 1e{exponent}"
+            if exponent in (3, 6, 9)
+            else "write time in seconds; or, if the samples really are so far apart, record faster than motion changes"
+        )
         yield Problem(
             "time.unit",
             "error",

@@ -83,6 +83,16 @@ def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
     meant = set(misspelled.values())
     commands = dict.fromkeys((*log.joints("command"), *_names_of(meant, "command")))
     positions = dict.fromkeys((*log.joints("position"), *_names_of(meant, "position")))
+    if log.is_motion and commands and not positions:
+        yield Problem(
+            "motion.not_recorded",
+            "warning",
+            "the whole file",
+            "this is a motion to be played, not a recording: it holds commands alone, and nothing can be fitted to it",
+            "play it on the robot, record what the sensors say, and give that; what a model makes of it: "
+            "`sysid-btr replay --model M --log FILE --out DIR`",
+        )
+        return
     for channel, names, purpose in (
         ("command", commands, "nothing says what the joints were told to do"),
         ("position", positions, "there is nothing to compare a replay with"),

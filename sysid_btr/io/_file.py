@@ -25,6 +25,7 @@ _EXAMPLE_META = '{"schema": 1, "robot": "nao", "mount": "fixed", "source": "meas
 _TIME_NAMES = ("t", "timestamp", "stamp", "time_s", "seconds", "sec")
 _IMPORT = "convert it with `sysid-btr import`, or write a Parquet log (schema 1) yourself"
 _AS_TABLE = "write its columns as CSV or Parquet, and convert that with `sysid-btr import`"
+_MODEL = "if it is the robot's model, give it with --model; else " + _AS_TABLE
 _ROS1 = "make it a ROS 2 bag with `rosbags-convert`, and convert that with `sysid-btr import`"
 # First bytes of what people hand over by mistake, how to call it, and what to do with it.
 _SIGNATURES = (
@@ -36,7 +37,7 @@ _SIGNATURES = (
     (b"\x89MCAP", "an MCAP file", _IMPORT),
     (b"SQLite format 3", "a SQLite file or ROS 2 bag", _IMPORT),
     (b"ARROW1", "an Arrow IPC (Feather) file", _AS_TABLE),
-    (b"<", "an XML file", _AS_TABLE),
+    (b"<", "an XML file", _MODEL),
     (b"{", "a JSON file", _AS_TABLE),
 )
 

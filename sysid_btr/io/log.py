@@ -36,6 +36,9 @@ IMU_NAMES = ("gyro_x", "gyro_y", "gyro_z", "acc_x", "acc_y", "acc_z", "angle_x",
 CHANNELS = (*JOINT_CHANNELS, "imu", "force")
 """Every channel of the schema; a column is ``<channel>.<name>``."""
 
+MOTION = "designed motion"
+"""`LogMeta.source` of commands that are to be played, and that nobody has recorded yet."""
+
 
 @dataclass(frozen=True)
 class LogMeta:
@@ -52,7 +55,7 @@ class LogMeta:
     sample_period : float or None
         Nominal sampling period, s; None for an irregular clock.
     source : str
-        Where the numbers come from, e.g. ``"measured"``.
+        Where the numbers come from, e.g. ``"measured"``; `MOTION` for commands that are to be played.
     command_hold : {"zoh", "linear"}
         What the robot does with a command between two samples.
     servo_period : float or None
@@ -134,6 +137,11 @@ class Log:
         from sysid_btr.report.notebook import html_of_log
 
         return html_of_log(self)
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether this is a motion to be played, by its own account and by what it holds: commands alone."""
+        return self.meta.source == MOTION and all(column.startswith("command.") for column in self.channels)
 
     def joints(self, channel: str) -> tuple[str, ...]:
         """Names that have a column in `channel`, in column order."""

@@ -64,11 +64,7 @@ def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[Fie
     field, colon, rest = expression.partition(":")
     if not colon or not rest:
         raise UsageError("expected FIELD:GLOB[,GLOB...][=shared], for example mass:*KneePitch or kp:*=shared")
-    fields = {**FIELDS, **robot.fields}
-    if field not in fields:
-        close = difflib.get_close_matches(field, fields, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise UsageError(f"unknown field {field!r}{hint}; fields are {', '.join(fields)}")
+    fields = _known_fields(field, robot)
     globs, equals, option = rest.partition("=")
     if equals and option != "shared":
         raise UsageError(f"after '=' only 'shared' is allowed, not {option!r}")
@@ -85,6 +81,50 @@ def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[Fie
     if option == "shared":
         return [_build(cls, tuple(names), robot, scales, label=globs)]
     return [_build(cls, group, robot, scales) for group in _motors(cls.scope, names, robot)]
+
+
+ALSO_CALLED = {
+    "friction": "frictionloss",
+    "coulomb_friction": "frictionloss",
+    "viscous_damping": "damping",
+    "joint_spring": "stiffness",
+    "spring": "stiffness",
+    "torque_limit": "force_limit",
+    "command_delay": "delay",
+    "com_offset": "com",
+    "p": "kp",
+    "d": "kv",
+    "kd": "kv",
+    "gain": "kp",
+}
+"""Names that people try -> fields; some are effects, which `close` looks for by itself."""
+
+
+def _known_fields(field: str, robot: Robot) -> dict[str, type[FieldModifier]]:
+    """All fields of a robot, if `field` is one."""
+    fields = {**FIELDS, **robot.fields}
+    if field not in fields:
+        meant = ALSO_CALLED.get(field) or next(iter(difflib.get_close_matches(field, fields, n=1)), None)
+        hint = f" (did you mean {meant!r}?)" if meant else ""
+        raise UsageError(f"unknown field {field!r}{hint}; fields are {', '.join(fields)}")
+    return fields
+
+
+def check_expression(name: str, robot: Robot) -> None:
+    """Check that a field, or a parameter's name, is one that the robot can have.
+
+    Raises
+    ------
+    UsageError
+        Saying what is unknown, and what there is.
+    """
+    label, colon, places = name.partition(":")
+    field, dot, kind = label.partition(".")
+    kinds = [k.name for k in _known_fields(field, robot)[field].kinds]
+    if dot and kind not in kinds:
+        raise UsageError(f"{field} has no {kind!r}; it has {', '.join(kinds)}")
+    if colon:
+        _parse_one(f"{field}:{places}", robot, None)
 
 
 def _scope_noun(scope: Scope) -> str:

@@ -166,6 +166,8 @@ class Modifier:
     known: tuple[Parameter, ...] = ()
 
     name: ClassVar[str] = ""
+    label: ClassVar[str] = ""
+    """In the names of its parameters, where the name alone would not tell it from another one beside it."""
     kinds: ClassVar[tuple[Kind, ...]] = ()
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
     """What the law may change beside the joint torque: gain and motor torque, friction, limits."""
@@ -185,7 +187,8 @@ class Modifier:
         result = []
         for group in self.groups:
             for kind in self.kinds:
-                label = self.name if len(self.kinds) == 1 else f"{self.name}.{kind.name}"
+                name = self.label or self.name
+                label = name if len(self.kinds) == 1 else f"{name}.{kind.name}"
                 result.append(
                     Parameter(
                         f"{label}:{group}",

@@ -93,10 +93,22 @@ def robot_from_file(path: Path) -> Robot:
         return mujoco.MjSpec.from_file(str(path))
 
     try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"model {path} cannot be read: {error.strerror}; check the file's permissions") from error
+    if not content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+        raise ModelError(
+            f"model {path}: this is no XML file, so it is neither MJCF nor URDF. Give the robot's model with --model, "
+            "and a log with --log"
+        )
+    try:
         make_spec().compile()
     except (ValueError, OSError) as error:
-        raise ModelError(f"model {path}: MuJoCo cannot read it: {error}") from error
-    return Robot(name=path.stem, make_spec=make_spec, path=path, digest=_digest(path.read_bytes()))
+        raise ModelError(
+            f"model {path}: MuJoCo cannot read it: {error}. Give an MJCF or URDF file that MuJoCo's own viewer opens "
+            "(python -m mujoco.viewer --mjcf=FILE), meshes and included files beside it"
+        ) from error
+    return Robot(name=path.stem, make_spec=make_spec, path=path, digest=_digest(content))
 
 
 def robot_from_spec(name: str, make_spec: Callable[[], mujoco.MjSpec], **known: object) -> Robot:

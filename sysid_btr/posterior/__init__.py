@@ -1,12 +1,16 @@
 """What a log says about parameters as a distribution: priors, sampling with real replays, checks, export.
 
->>> from sysid_btr.posterior import posterior
->>> drawn = posterior(fit(study, ["mass:*Knee*", "kp:*=shared"]))
+>>> import sysid_btr as sb
+>>> drawn = sb.posterior(sb.fit(study, ["mass:*Knee*", "kp:*=shared"]))  # doctest: +SKIP
+
+``sysid_btr.posterior`` is this package, and the function at the same time: calling the package calls the function.
 """
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,3 +27,17 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it offers {', '.join(__all__)}")
     return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+class _Package(ModuleType):
+    """A package that is called like its function, so that ``sb.posterior`` means one thing in whatever order the
+    two were imported.
+    """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Posterior:
+        from sysid_btr.posterior.draw import posterior
+
+        return posterior(*args, **kwargs)
+
+
+sys.modules[__name__].__class__ = _Package

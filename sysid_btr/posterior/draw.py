@@ -64,6 +64,11 @@ class Posterior:
     replays: int
     seconds: float
 
+    def _repr_html_(self) -> str:
+        from sysid_btr.report.notebook import html_of_outcome
+
+        return html_of_outcome(self)
+
     @property
     def study(self) -> Study:
         """As fitted."""

@@ -3,70 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr.report.figures import DARK, LIGHT, MODEL_COLOURS, page_style
+from sysid_btr.report.figures import figure_of
+from sysid_btr.report.style import FOUND, PLAIN, faint, ink, new_figure, on_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLUMNS = 3
 SHOWN = 30
 """Models drawn of each iteration, best last and darkest."""
 
 
-def draw_btr(result: Mapping[str, Any], *, dark: bool = False, truth: Mapping[str, float] | None = None) -> bytes:
-    """PNG of a result of kind ``btr``.
+def plot_btr(
+    result: Mapping[str, Any], figure: Figure | None = None, *, truth: Mapping[str, float] | None = None
+) -> list[Axes]:
+    """Fitness, its difference between model and robot, and each of the model's parameters over the iterations.
 
     Parameters
     ----------
-    result : content of result.json.
-    dark : for a dark page.
+    result : content of result.json, of kind ``btr``.
+    figure : to draw on; a new one if None.
     truth : parameter -> value in the robot, where it is known.
     """
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    theme = DARK if dark else LIGHT
     rounds = result["iterations"]
     names = list(dict.fromkeys(n for r in rounds for n in r["model"]))
     count = 2 + len(names)
-    rows = -(-count // COLUMNS)
-    with rc_context({**page_style(theme), "legend.frameon": False}):
-        figure = Figure(figsize=(13, 0.4 + 2.8 * rows), layout="constrained", facecolor=theme["paper"])
-        FigureCanvasAgg(figure)
-        axes = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
-        _fitness(axes[0], result, theme)
-        _difference(axes[1], rounds)
-        for axis, name in zip(axes[2:], names, strict=False):
-            _parameter(axis, rounds, name, theme, (truth or {}).get(name))
-        for axis in axes[:count]:
-            axis.set_xlabel("iteration")
-            axis.locator_params(axis="x", integer=True)
-        for axis in axes[count:]:
-            axis.set_visible(False)
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
+    columns = 2 if count == 4 else min(count, COLUMNS)
+    rows = -(-count // columns)
+    figure = new_figure(13, 0.4 + 2.8 * rows) if figure is None else figure
+    axes = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    _fitness(axes[0], result)
+    _difference(axes[1], rounds)
+    for axis, name in zip(axes[2:], names, strict=False):
+        _parameter(axis, rounds, name, (truth or {}).get(name))
+    for axis in axes[:count]:
+        axis.set_xlabel("iteration")
+        axis.locator_params(axis="x", integer=True)
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    return axes[:count]
+
+
+def draw_btr(result: Mapping[str, Any], *, dark: bool = False, truth: Mapping[str, float] | None = None) -> bytes:
+    """`plot_btr` as a PNG file, for a light or a dark page."""
+    return on_page(lambda: figure_of(plot_btr(result, truth=truth)), dark=dark)
 
 
 def _numbers(values: Sequence[float | None]) -> list[float]:
     return [np.nan if v is None else v for v in values]
 
 
-def _fitness(axis: Axes, result: Mapping[str, Any], theme: Mapping[str, str]) -> None:
+def _fitness(axis: Axes, result: Mapping[str, Any]) -> None:
     rounds = result["iterations"]
     x = [r["number"] for r in rounds]
     at = [t["iteration"] for t in result["trials"]]
-    axis.scatter(at, _numbers([t["fitness"] for t in result["trials"]]), s=8, color=theme["faint"], label="trials")
+    axis.scatter(at, _numbers([t["fitness"] for t in result["trials"]]), s=8, color=faint(), label="trials")
     for key, label, colour, line in (
-        ("best", "best on the robot", MODEL_COLOURS[2], "-"),
-        ("mean", "mean on the robot", MODEL_COLOURS[2], ":"),
-        ("expected", "best in the model", MODEL_COLOURS[0], "--"),
+        ("best", "best on the robot", FOUND, "-"),
+        ("mean", "mean on the robot", FOUND, ":"),
+        ("expected", "best in the model", PLAIN, "--"),
     ):
         axis.plot(x, _numbers([r["fitness"][key] for r in rounds]), line, color=colour, label=label)
     axis.set_ylabel(f"fitness ({result['units']['fitness']})")
@@ -76,8 +76,8 @@ def _fitness(axis: Axes, result: Mapping[str, Any], theme: Mapping[str, str]) ->
 def _difference(axis: Axes, rounds: Sequence[Mapping[str, Any]]) -> None:
     x = [r["number"] for r in rounds]
     for key, label, colour, line in (
-        ("transfer", "foreseen", MODEL_COLOURS[0], "--"),
-        ("corrected", "after correction", MODEL_COLOURS[2], "-"),
+        ("transfer", "foreseen", PLAIN, "--"),
+        ("corrected", "after correction", FOUND, "-"),
     ):
         axis.plot(x, _numbers([r["delta_fitness"][key] for r in rounds]), line, color=colour, label=label)
     axis.set_ylabel("mean |model - robot| (m/s)")
@@ -86,9 +86,7 @@ def _difference(axis: Axes, rounds: Sequence[Mapping[str, Any]]) -> None:
     axis.legend(fontsize=7)
 
 
-def _parameter(
-    axis: Axes, rounds: Sequence[Mapping[str, Any]], name: str, theme: Mapping[str, str], truth: float | None
-) -> None:
+def _parameter(axis: Axes, rounds: Sequence[Mapping[str, Any]], name: str, truth: float | None) -> None:
     for r in rounds:
         names, values = list(r["models"]["names"]), np.array(r["models"]["values"], dtype=np.float64)
         if name not in names or not len(values):
@@ -97,9 +95,9 @@ def _parameter(
         order = np.argsort(-np.nan_to_num(losses, nan=np.inf), kind="stable")[-SHOWN:]
         shade = np.linspace(0.05, 0.5, len(order))
         place = np.full(len(order), float(r["number"]))
-        axis.scatter(place, values[order, names.index(name)], s=10, color=theme["faint"], alpha=shade.tolist(), lw=0)
+        axis.scatter(place, values[order, names.index(name)], s=10, color=faint(), alpha=shade.tolist(), lw=0)
     x = [r["number"] for r in rounds if name in r["model"]]
-    axis.plot(x, [r["model"][name] for r in rounds if name in r["model"]], color=theme["ink"])
+    axis.plot(x, [r["model"][name] for r in rounds if name in r["model"]], color=ink())
     if truth is not None:
-        axis.axhline(truth, color=MODEL_COLOURS[0], lw=0.8, ls="--")
+        axis.axhline(truth, color=PLAIN, lw=0.8, ls="--")
     axis.set_ylabel(name)

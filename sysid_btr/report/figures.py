@@ -1,19 +1,20 @@
-"""The overlay: command, log and models at the joints where the model was most wrong, and what is left."""
+"""Where the model was most wrong: command, log and models, and what is left of the error; the course of a search."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.report.style import FOUND, MODEL_COLOURS, PLAIN, SHADE, faint, ink, new_figure, on_page
 from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
@@ -51,9 +52,18 @@ class Trace:
     split: float
     noise: float
 
+    @property
+    def held_out(self) -> BoolArray:
+        """(n,) samples from the split on."""
+        return np.asarray(self.time >= self.split)
+
+    def residual(self, name: str) -> FloatArray:
+        """(m,) log minus model on the held-out part; NaN where nothing was measured."""
+        return np.asarray((self.measured - self.predicted[name])[self.held_out])
+
     def error(self, name: str) -> float:
         """Root-mean-square error of one model on the held-out part, in noise floors."""
-        residual = (self.measured - self.predicted[name])[self.time >= self.split]
+        residual = self.residual(name)
         residual = residual[np.isfinite(residual)]
         return float(np.sqrt(np.mean(residual**2)) / self.noise) if len(residual) else 0.0
 
@@ -120,67 +130,140 @@ def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, .
     return tuple(traces[:JOINTS_SHOWN])
 
 
-LIGHT = {"ink": "#1f2328", "faint": "#8b949e", "shade": "#0969da14", "paper": "white"}
-DARK = {"ink": "#e6edf3", "faint": "#768390", "shade": "#58a6ff1f", "paper": "#0d1117"}
-MODEL_COLOURS = ("#d1495b", "#edae49", "#2e9e6b")
-"""Plain, parameters fitted, effects added; told apart also without red and green."""
-
-
-def page_style(theme: Mapping[str, str]) -> dict[Any, Any]:
-    """Matplotlib's settings for a page of a report."""
-    return {
-        "font.size": 9,
-        "text.color": theme["ink"],
-        "axes.labelcolor": theme["ink"],
-        "axes.edgecolor": theme["faint"],
-        "axes.facecolor": theme["paper"],
-        "xtick.color": theme["faint"],
-        "ytick.color": theme["faint"],
-        "xtick.labelcolor": theme["ink"],
-        "ytick.labelcolor": theme["ink"],
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-    }
-
-
-def draw_overlay(traces: Sequence[Trace], *, dark: bool = False) -> bytes:
-    """PNG of the traces: whole log, a close-up of the held-out part, and the residual there.
+def plot_overlay(traces: Sequence[Trace], figure: Figure | None = None) -> Any:
+    """The traces: whole log, a close-up of the held-out part, and the residual there.
 
     Parameters
     ----------
     traces : one a row.
-    dark : for a dark page.
+    figure : to draw on; a new one if None.
+
+    Returns
+    -------
+    ndarray
+        (traces, 3) of Axes.
     """
     from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    theme = DARK if dark else LIGHT
-    with rc_context({**page_style(theme), "lines.linewidth": 1.1}):
-        rows = max(len(traces), 1)
-        figure = Figure(figsize=(13, 0.6 + 2.5 * rows), layout="constrained", facecolor=theme["paper"])
-        FigureCanvasAgg(figure)
+    rows = max(len(traces), 1)
+    figure = new_figure(13, 0.6 + 2.5 * rows) if figure is None else figure
+    with rc_context({"lines.linewidth": 1.1}):
         axes = figure.subplots(rows, 3, squeeze=False, width_ratios=(1.5, 1.1, 1.1))
         for row, item in zip(axes, traces, strict=False):
-            _draw_row(row, item, theme)
-        if traces:
-            handles, labels = axes[0][1].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-            for axis in axes[-1]:
-                axis.set_xlabel("time (s)")
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
+            _draw_row(row, item)
+    if traces:
+        _legend(figure, axes[0][1])
+        for axis in axes[-1]:
+            axis.set_xlabel("time (s)")
+    return axes
 
 
-def _draw_row(row: Sequence[Axes], item: Trace, theme: Mapping[str, str]) -> None:
+def draw_overlay(traces: Sequence[Trace], *, dark: bool = False) -> bytes:
+    """`plot_overlay` as a PNG file, for a light or a dark page."""
+    return on_page(lambda: figure_of(plot_overlay(traces)), dark=dark)
+
+
+LAGS = 1.0
+"""s over which residuals are correlated."""
+BAND = 1.96
+"""Standard deviations of a 95 % band."""
+
+
+def plot_residuals(traces: Sequence[Trace], figure: Figure | None = None) -> Any:
+    """What is left on the held-out part: correlation of each model's residual with itself and with the command's rate.
+
+    Within the band, which holds 95 % of the lags where nothing is left but white noise, a residual has no memory
+    (left) and does not follow from what was commanded (right). The right says more about a simulation: its errors
+    have a memory even where the model is right (Ljung 1999, System Identification, section 16.6).
+
+    Returns
+    -------
+    ndarray
+        (traces, 2) of Axes.
+    """
+    rows = max(len(traces), 1)
+    figure = new_figure(13, 0.6 + 1.9 * rows) if figure is None else figure
+    axes = figure.subplots(rows, 2, squeeze=False)
+    for (left, right), item in zip(axes, traces, strict=False):
+        period = float(np.median(np.diff(item.time))) if len(item.time) > 1 else 1.0
+        lags = max(min(round(LAGS / period), int(item.held_out.sum()) // 2), 1)
+        rate = np.gradient(item.command)[item.held_out] if len(item.command) > 1 else item.command[item.held_out]
+        for name, colour in _coloured(item):
+            residual = item.residual(name)
+            for axis, other in ((left, residual), (right, rate)):
+                correlation, band = correlate(residual, other, lags)
+                axis.plot(period * np.arange(lags + 1), correlation, color=colour, lw=1, label=name)
+        for axis in (left, right):
+            axis.axhspan(-band, band, color=faint(), alpha=0.3, lw=0)
+            axis.set_xlim(0, period * lags)
+            axis.set_ylim(-1.05, 1.05)
+        left.set_ylabel(item.joint)
+    axes[0][0].set_title("residual with itself, by lag", fontsize=9)
+    axes[0][1].set_title("residual with the rate of the command before it, by lag", fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("lag (s)")
+    if traces:
+        _legend(figure, axes[0][0])
+    return axes
+
+
+def correlate(late: FloatArray, early: FloatArray, lags: int) -> tuple[FloatArray, float]:
+    """Correlation of one signal with another that many samples before, and the band of white noise.
+
+    Parameters
+    ----------
+    late, early : (n,) NaN where missing; such pairs are left out.
+    lags : largest, samples.
+
+    Returns
+    -------
+    (ndarray, float)
+        (lags + 1,) coefficients, and half the band that holds 95 % of them for signals with nothing in common.
+    """
+    a, b = (np.where(np.isfinite(x), x - np.nanmean(x), 0.0) if np.isfinite(x).any() else np.zeros(len(x))
+            for x in (late, early))  # fmt: skip
+    size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
+    found = np.array([np.dot(a[k:], b[: len(b) - k]) for k in range(lags + 1)]) / max(size, 1e-300)
+    count = int(np.sum(np.isfinite(late) & np.isfinite(early)))
+    return found, BAND / np.sqrt(max(count, 1))
+
+
+def plot_convergence(fit: Fit, axes: Axes | None = None) -> Axes:
+    """Best loss so far over the replays of a fit."""
+    axes = new_figure(8, 3).subplots() if axes is None else axes
+    done = np.array([n for n, _ in fit.result.history], dtype=np.float64)
+    best = np.array([loss for _, loss in fit.result.history], dtype=np.float64)
+    if len(done):
+        end = max(float(fit.result.evaluations), done[-1])
+        axes.step([*done, end], [*best, best[-1]], where="post", color=ink(), lw=1.2)
+        axes.plot(done, best, ".", color=FOUND, ms=5)
+        if best.min() > 0 and best.max() > 3 * best.min():
+            axes.set_yscale("log")
+    axes.set_xlabel("replays")
+    axes.set_ylabel("best loss")
+    return axes
+
+
+def figure_of(axes: Any) -> Figure:
+    """The figure that some axes are of."""
+    figure = np.asarray(axes, dtype=object).ravel()[0].get_figure(root=True)
+    assert figure is not None
+    return figure  # type: ignore[no-any-return]
+
+
+def _legend(figure: Figure, axis: Axes) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+
+
+def _draw_row(row: Sequence[Axes], item: Trace) -> None:
     whole, close, left = row
     low, high = _zoom(item)
     for axis, (begin, end) in ((whole, (item.time[0], item.time[-1])), (close, (low, high))):
-        _draw_lines(axis, item, begin, end, theme)
+        _draw_lines(axis, item, begin, end)
         axis.set_xlim(begin, end)
     if 0 < item.split < item.time[-1]:
-        whole.axvspan(item.split, item.time[-1], color=theme["shade"], lw=0)
+        whole.axvspan(item.split, item.time[-1], color=SHADE, lw=0)
         whole.text(item.split, 1.0, " held out", transform=whole.get_xaxis_transform(), va="top", fontsize=8)
     whole.set_ylabel(f"{item.joint} ({item.unit})")
     close.set_title("close-up of the held-out part", fontsize=9)
@@ -188,7 +271,7 @@ def _draw_row(row: Sequence[Axes], item: Trace, theme: Mapping[str, str]) -> Non
     for name, colour in _coloured(item):
         x, y = _window(item.time, (item.measured - item.predicted[name]) * factor, low, high)
         left.plot(x, y, color=colour, lw=0.9)
-    left.axhspan(-2 * item.noise * factor, 2 * item.noise * factor, color=theme["faint"], alpha=0.3, lw=0)
+    left.axhspan(-2 * item.noise * factor, 2 * item.noise * factor, color=faint(), alpha=0.3, lw=0)
     left.set_xlim(low, high)
     for axis in row:
         axis.locator_params(nbins=6)
@@ -197,11 +280,11 @@ def _draw_row(row: Sequence[Axes], item: Trace, theme: Mapping[str, str]) -> Non
     left.set_title(f"rmse {errors} (band: 2 x noise)", fontsize=8)
 
 
-def _draw_lines(axis: Axes, item: Trace, begin: float, end: float, theme: Mapping[str, str]) -> None:
+def _draw_lines(axis: Axes, item: Trace, begin: float, end: float) -> None:
     x, y = _window(item.time, item.command, begin, end)
-    axis.plot(x, y, color=theme["faint"], lw=0.8, ls="--", drawstyle="steps-post", label="command")
+    axis.plot(x, y, color=faint(), lw=0.8, ls="--", drawstyle="steps-post", label="command")
     x, y = _window(item.time, item.measured, begin, end)
-    axis.plot(x, y, color=theme["ink"], lw=1.6, label="log")
+    axis.plot(x, y, color=ink(), lw=1.6, label="log")
     for name, colour in _coloured(item):
         x, y = _window(item.time, item.predicted[name], begin, end)
         axis.plot(x, y, color=colour, label=name)
@@ -209,7 +292,7 @@ def _draw_lines(axis: Axes, item: Trace, begin: float, end: float, theme: Mappin
 
 def _coloured(item: Trace) -> list[tuple[str, str]]:
     names = list(item.predicted)
-    colours = (MODEL_COLOURS[0], MODEL_COLOURS[2]) if len(names) == 2 else MODEL_COLOURS
+    colours = (PLAIN, FOUND) if len(names) == 2 else MODEL_COLOURS
     return list(zip(names, colours, strict=False))
 
 

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.report.changes import model_lines
-from sysid_btr.report.text import compact, number, stages, told
+from sysid_btr.report.text import compact, number, stages, told, walk_words
 from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
     from jinja2 import Template
 
+LARGEST, LARGEST_RAW = 4_000_000, 500_000
+"""Characters of a page's pictures, and of result.json in it; the whole stays below 5 MB."""
 TEMPLATE = Path(__file__).with_name("report.html.j2")
 VERDICTS = {
     "explained": "The log shows effects that the model lacks, and they are named below.",
@@ -25,40 +28,103 @@ VERDICTS = {
 }
 
 
-def render(result: Mapping[str, Any], overlay: bytes | None = None, overlay_dark: bytes | None = None) -> str:
-    """The report of a result.
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the report.
+
+    Attributes
+    ----------
+    title, note : heading, and how to read it.
+    light, dark : PNG for a light and a dark page; without the latter the former serves both.
+    """
+
+    title: str
+    note: str
+    light: bytes
+    dark: bytes | None = None
+
+
+def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
+    """The report of a result: one HTML page that needs nothing else.
 
     Parameters
     ----------
     result : content of result.json.
-    overlay, overlay_dark : PNG for a light and a dark page; without the latter the former serves both.
+    pictures : in the order in which they are shown. The first comes after the table of errors, the others at the
+        end; where the page would grow beyond `LARGEST`, those for dark pages are left out, then the last ones.
     """
+    shown, left_out = _fitting(pictures)
+    raw = json.dumps(result, ensure_ascii=False)
     return _template().render(
         r=result,
         stages=stages(result),
         verdict_text=VERDICTS.get(result.get("verdict", ""), ""),
         rows=list(_error_rows(result)),
+        floors=any(floor is not None for floor in result.get("noise_floor", {}).values()),
         bars=_bars(result),
         estimates=[
             *result.get("parameters", []),
             *(p for e in result.get("effects", []) for p in e["parameters"]),
         ],
-        overlay=None if overlay is None else _data_uri(overlay),
-        overlay_dark=None if overlay_dark is None else _data_uri(overlay_dark),
+        intervals=_intervals(result),
+        pictures=[(p, _data_uri(p.light), None if p.dark is None else _data_uri(p.dark)) for p in shown],
+        left_out=left_out,
         changes=list(model_lines(result)),
-        raw=json.dumps(result, ensure_ascii=False),
+        walks=["; ".join(walk_words(w)) for w in result.get("walks", []) if w["part"] == "train"],
+        raw=raw if len(raw) <= LARGEST_RAW else None,
     )
+
+
+def _intervals(result: Mapping[str, Any]) -> str:
+    """What the intervals of a result are, in a sentence."""
+    limit = "they do not cover a model that is wrong in a way nobody named."
+    return {
+        "btr": f"Intervals are of the {result.get('intervals', '')}; {limit}",
+        "posterior": "Value: posterior mean; interval: the central 95 % of the draws. The likelihood counts correlated "
+        f"residuals and the replay's own numerical error; {limit}",
+        "excite": "What a fit of a log of this motion to this model is expected to give (the Cramer-Rao bound), beside "
+        "the same of the motion it is compared with.",
+    }.get(
+        result["kind"],
+        f"Intervals hold for correlated residuals and for the replay's own numerical error; {limit}",
+    )
+
+
+def _fitting(pictures: Sequence[Picture]) -> tuple[list[Picture], list[str]]:
+    """The pictures for which there is room, and the titles of the others."""
+    shown = list(pictures)
+    if _size(shown) > LARGEST:
+        shown = [replace(p, dark=None) for p in shown]
+    left_out: list[str] = []
+    while _size(shown) > LARGEST:
+        left_out.insert(0, shown.pop().title)
+    return shown, left_out
+
+
+def _size(pictures: Sequence[Picture]) -> int:
+    """Characters of pictures in the page: four for every three bytes."""
+    return sum((len(p.light) + len(p.dark or b"")) * 4 // 3 for p in pictures)
 
 
 @cache
 def _template() -> Template:
     from jinja2 import Environment, StrictUndefined
 
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters.update(
+        si=si, number=number, told=told, compact=compact, digits=with_digits_of, typeset=_typeset, count=_count
     )
-    environment.filters.update(si=si, number=number, told=told, compact=compact, digits=with_digits_of)
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+
+
+def _count(value: float | None) -> str:
+    """A number of things."""
+    return "-" if value is None else f"{value:,.0f}".replace(",", "\u202f")
+
+
+def _typeset(text: str) -> str:
+    """Signs that a terminal may not have."""
+    return text.replace("+-", "±").replace("->", "→")
 
 
 def _data_uri(png: bytes) -> str:
@@ -68,14 +134,12 @@ def _data_uri(png: bytes) -> str:
 def _error_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     rows = []
     for part, label in (("train", "fitted data"), ("holdout", "held out")):
-        for channel in result["nominal"].get(part, {}):
+        for channel in result.get("nominal", {}).get(part, {}):
             unit = result["units"].get(channel, "").partition(",")[0]
             scores = [result[key][part].get(channel) for key, _ in stages(result)]
             values = [None if s is None else s["rmse"] for s in scores]
             *errors, floor = si_all([*values, result["noise_floor"].get(channel)], unit)
-            cells = [
-                None if s is None else {**s, "text": text} for s, text in zip(scores, errors, strict=True)
-            ]
+            cells = [None if s is None else {**s, "text": text} for s, text in zip(scores, errors, strict=True)]
             rows.append({"channel": channel, "part": label, "cells": cells, "floor": floor})
     return rows
 

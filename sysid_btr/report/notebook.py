@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 from io import StringIO
 from typing import TYPE_CHECKING, Any
@@ -16,18 +17,24 @@ if TYPE_CHECKING:
     from sysid_btr.identify.fit import Fit
     from sysid_btr.io.log import Log
     from sysid_btr.models.robot import Robot
+    from sysid_btr.posterior.draw import Posterior
 
 FRAME = '<pre style="white-space:pre;overflow-x:auto;line-height:1.25;font-family:monospace">{code}</pre>'
 
 
-def html_of_outcome(outcome: Fit | Closing) -> str:
+def html_of_outcome(outcome: Fit | Closing | Posterior) -> str:
     """The tables of the command line."""
-    from rich.console import Console
-
     from sysid_btr.result import make_result
 
+    return html_of_result(make_result(outcome))
+
+
+def html_of_result(result: Mapping[str, Any]) -> str:
+    """The same of the content of result.json."""
+    from rich.console import Console
+
     out = Console(file=StringIO(), record=True, width=PLAIN_WIDTH, highlight=False, emoji=False, markup=False)
-    show(make_result(outcome), out)
+    show(result, out)
     return out.export_html(inline_styles=True, code_format=FRAME)
 
 

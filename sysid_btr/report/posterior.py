@@ -1,14 +1,14 @@
-"""Figures of posteriors and profiles: functions that draw on axes and return them, and their PNG."""
+"""Figures of posteriors and profiles: functions that draw on axes and return them."""
 
 from __future__ import annotations
 
-from io import BytesIO
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.optional import optional
+from sysid_btr.report.style import FOUND, PLAIN, faint, ink, new_figure
 from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
@@ -19,28 +19,10 @@ if TYPE_CHECKING:
     from sysid_btr.posterior.draw import Posterior
     from sysid_btr.posterior.predictive import Band
 
-INK, FAINT, MODEL, FITTED = "#1f2328", "#8b949e", "#2e9e6b", "#d1495b"
 MOST_PARAMETERS = 12
 """Parameters of a corner plot or a trace; more cannot be read."""
 BANDS_SHOWN = 3
 ZOOM_SECONDS = 3.0
-
-
-def new_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
-    """A figure that belongs to nobody's screen."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout=layout)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as a PNG file."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=100, metadata={"Software": None})
-    return buffer.getvalue()
 
 
 def shown_parameters(posterior: Posterior) -> list[int]:
@@ -80,12 +62,13 @@ def plot_corner(posterior: Posterior, figure: Figure | None = None) -> FloatArra
         truths=[v if a - s < v < a + 2 * s else None for v, a, s in panels],
         range=[(float(a - 0.02 * s), float(a + 1.02 * s)) for _, a, s in panels],
         quantiles=[0.025, 0.5, 0.975],
-        truth_color=FITTED,
-        color=INK,
+        truth_color=PLAIN,
+        color=ink(),
         quiet=True,
         plot_datapoints=False,
         plot_density=False,
         fill_contours=True,
+        no_fill_contours=True,  # the base fill is white
         label_kwargs={"fontsize": 8},
     )
     axes: Any = np.array(figure.axes).reshape(len(which), len(which))
@@ -132,8 +115,8 @@ def plot_band(band: Band, axes: Axes) -> Axes:
     inside = _worst_stretch(band)
     time = band.time[inside]
     mean, half = band.mean[inside], band.half_width[inside]
-    axes.fill_between(time, mean - half, mean + half, color=MODEL, alpha=0.35, lw=0, label="95 % of the posterior")
-    axes.plot(time, band.measured[inside], color=INK, lw=1.2, label="log")
+    axes.fill_between(time, mean - half, mean + half, color=FOUND, alpha=0.35, lw=0, label="95 % of the posterior")
+    axes.plot(time, band.measured[inside], color=ink(), lw=1.2, label="log")
     axes.set_ylabel(f"{band.joint} ({band.unit})", fontsize=8)
     axes.set_xlabel("time (s)", fontsize=8)
     axes.legend(fontsize=7, frameon=False)
@@ -146,8 +129,8 @@ def plot_band_error(band: Band, axes: Axes) -> Axes:
     at = np.flatnonzero(band.held_out)
     at = at[:: max(len(at) // 2000, 1)]
     half, off = band.half_width[at], (band.measured - band.mean)[at]
-    axes.fill_between(band.time[at], -half, half, color=MODEL, alpha=0.35, lw=0)
-    axes.plot(band.time[at], off, color=INK, lw=0.6)
+    axes.fill_between(band.time[at], -half, half, color=FOUND, alpha=0.35, lw=0)
+    axes.plot(band.time[at], off, color=ink(), lw=0.6)
     share = float(np.mean(band.inside)) if len(band.inside) else float("nan")
     error, knowledge = si_all([band.error, float(np.sqrt(np.mean(band.spread[at] ** 2)))], band.unit)
     axes.set_title(
@@ -164,41 +147,15 @@ def plot_profile(profile: Profile, axes: Axes | None = None) -> Axes:
     axes = new_figure(6, 4).subplots() if axes is None else axes
     if profile.std > 0:
         x = np.linspace(profile.values[0], profile.values[-1], 200)
-        axes.plot(x, ((x - profile.best) / profile.std) ** 2, color=FAINT, lw=1, ls="--", label="standard error")
-    axes.plot(profile.values, profile.deviance, color=INK, marker="o", ms=3.5, lw=1.2, label="others fitted anew")
-    axes.axhline(profile.threshold, color=FITTED, lw=0.8)
-    axes.axvspan(*profile.interval, color=MODEL, alpha=0.15, lw=0, label="95 % interval")
+        axes.plot(x, ((x - profile.best) / profile.std) ** 2, color=faint(), lw=1, ls="--", label="standard error")
+    axes.plot(profile.values, profile.deviance, color=ink(), marker="o", ms=3.5, lw=1.2, label="others fitted anew")
+    axes.axhline(profile.threshold, color=PLAIN, lw=0.8)
+    axes.axvspan(*profile.interval, color=FOUND, alpha=0.15, lw=0, label="95 % interval")
     axes.set_ylim(0, 1.6 * profile.threshold)
     axes.set_xlabel(profile.name + (" (x nominal)" if profile.unit == "1" else f" ({profile.unit})"))
     axes.set_ylabel("deviance")
     axes.legend(fontsize=8, frameon=False)
     return axes
-
-
-def corner_png(posterior: Posterior) -> bytes:
-    """`plot_corner` as a PNG file."""
-    return png(plot_corner(posterior)[0, 0].figure)
-
-
-def trace_png(posterior: Posterior) -> bytes:
-    """`plot_trace` as a PNG file."""
-    return png(_figure_of(plot_trace(posterior)[0]))
-
-
-def bands_png(posterior: Posterior) -> bytes:
-    """`plot_bands` as a PNG file."""
-    return png(_figure_of(plot_bands(posterior)[0]))
-
-
-def profile_png(profile: Profile) -> bytes:
-    """`plot_profile` as a PNG file."""
-    return png(_figure_of(plot_profile(profile)))
-
-
-def _figure_of(axes: Axes) -> Figure:
-    figure = axes.get_figure(root=True)
-    assert figure is not None
-    return figure
 
 
 def _colours() -> list[str]:

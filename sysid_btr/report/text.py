@@ -85,7 +85,7 @@ def walk_words(walk: Mapping[str, Any]) -> Iterator[str]:
 
 
 def stages(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """(key, name) of the models that a result compares."""
+    """(key, name) of the models that a result compares; none where nothing was compared with a log."""
     names = {
         "replay": [("nominal", "replayed")],
         "fit": [("nominal", "plain model"), ("before", "fitted")],
@@ -93,7 +93,7 @@ def stages(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         "close": [("nominal", "plain model"), ("before", "parameters fitted"), ("after", "effects added")],
         "btr": [("nominal", "plain model"), ("after", "corrected by the trials")],
     }
-    return names[result["kind"]]
+    return names.get(result["kind"], [])
 
 
 def errors_table(result: Mapping[str, Any]) -> Table:

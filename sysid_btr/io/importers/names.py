@@ -25,7 +25,8 @@ def folded(name: str) -> str:
 def suggestions(foreign: Iterable[str], model: Sequence[str]) -> dict[str, str]:
     """Joints of the model that names of a log may mean; one of each at most, exact names left out.
 
-    Names alike but for case and separators come first; then the most alike, never left for right.
+    Names alike but for case and separators come first; then the most alike, never left for right; then those of
+    whose words one name has all and the other more, if no second one does.
     """
     free = [name for name in model if name not in set(foreign)]
     names = [name for name in foreign if name not in model]
@@ -43,7 +44,25 @@ def suggestions(foreign: Iterable[str], model: Sequence[str]) -> dict[str, str]:
         if close:
             found[name] = by_fold[close[0]]
             free.remove(found[name])
+    for name in names:
+        if name in found:
+            continue
+        likely = [other for other in free if _shares_words(name, other)]
+        if len(likely) == 1 and not any(_shares_words(n, likely[0]) for n in names if n not in found and n != name):
+            found[name] = likely[0]
+            free.remove(likely[0])
     return found
+
+
+def _words(name: str) -> frozenset[str]:
+    """Words of a name, as separators and capitals part them."""
+    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", name)
+    return frozenset(part.casefold() for part in parts) - frozenset(_NOISE)
+
+
+def _shares_words(name: str, other: str) -> bool:
+    a, b = _words(name), _words(other)
+    return bool(a and b) and (a <= b or b <= a) and not _other_side(name, other)
 
 
 def quoted(text: str) -> str:

@@ -1,0 +1,193 @@
+"""``make docs``: the guide's pages, tables made from the code, and the API reference from docstrings, as HTML.
+
+    python docs/build.py [DIR]        # default docs/html
+
+A page is a Markdown file in docs/guide; `PAGES` has those made from code. pdoc makes the reference.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+import re
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from html import escape
+from importlib import import_module
+from itertools import groupby
+from pathlib import Path
+
+import pdoc
+from pdoc.render_helpers import to_html
+
+import sysid_btr
+import sysid_btr.posterior
+from sysid_btr.effects.library import EFFECTS
+
+HERE = Path(__file__).parent
+TITLES = {
+    "index": "Overview",
+    "robot_and_log": "Your robot and your log",
+    "verdicts": "What each verdict means",
+    "effects": "Effects",
+    "limits": "Limits",
+    "commands": "Commands",
+    "reference": "API",
+}
+"""Pages in the order of the menu."""
+NOT_DOCUMENTED = ("sysid_btr.cli", "sysid_btr.demo", "sysid_btr.report.render_worker")
+FRAME = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark"><title>{title} - sysid_btr</title><style>
+:root {{ --paper: #fff; --ink: #1f2328; --faint: #59636e; --line: #d1d9e0; --panel: #f6f8fa; --link: #0969da; }}
+@media (prefers-color-scheme: dark) {{ :root {{
+  --paper: #0d1117; --ink: #e6edf3; --faint: #9198a1; --line: #3d444d; --panel: #151b23; --link: #4493f8; }} }}
+body {{ margin: 0 auto; max-width: 60rem; padding: 1.5rem 1.25rem 4rem; background: var(--paper); color: var(--ink);
+  font: 16px/1.6 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }}
+nav {{ border-bottom: 1px solid var(--line); padding-bottom: .6rem; margin-bottom: 1.5rem; }}
+nav a {{ margin-right: 1.2rem; }} nav b {{ margin-right: 1.2rem; }}
+a {{ color: var(--link); text-decoration: none; }} a:hover {{ text-decoration: underline; }}
+h2 {{ margin-top: 2.2rem; }} h3 {{ margin-top: 1.6rem; }}
+pre {{ background: var(--panel); padding: .8rem 1rem; overflow-x: auto; font-size: .85rem; line-height: 1.45; }}
+code {{ font-family: ui-monospace, monospace; font-size: .9em; }} pre code {{ font-size: inherit; }}
+table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
+th, td {{ padding: .35rem .9rem .35rem 0; text-align: left; vertical-align: top;
+  border-bottom: 1px solid var(--line); }}
+</style></head><body><nav>{menu}</nav>
+{body}
+</body></html>
+"""
+
+
+def main(argv: list[str]) -> int:
+    """Write all pages; 1 if a link leads nowhere."""
+    out = Path(argv[0]) if argv else HERE / "html"
+    shutil.rmtree(out, ignore_errors=True)
+    for package in (sysid_btr, sysid_btr.posterior):
+        for name in package.__all__:  # loaded when they are first used; pdoc looks for what is there
+            setattr(package, name, getattr(package, name))
+    # types that are imported for the type checker alone are shown by their names
+    warnings.filterwarnings("ignore", "Error parsing type annotation", UserWarning)
+    # a package brings its modules unless it says what it offers; all are wanted
+    warnings.filterwarnings("ignore", "The module specification", UserWarning)
+    convert = pdoc.docstrings.numpy
+    pdoc.docstrings.numpy = lambda text: convert(spaced(text))
+    pdoc.render.configure(docformat="numpy", footer_text="sysid_btr", show_source=False)
+    pdoc.pdoc(*modules(), *(f"!{name}" for name in NOT_DOCUMENTED), r"!.*\._", output_directory=out / "api")
+    for name, title in TITLES.items():
+        text = PAGES[name]() if name in PAGES else (HERE / "guide" / f"{name}.md").read_text(encoding="utf-8")
+        (out / f"{name}.html").write_text(page(name, title, text), encoding="utf-8")
+    broken = sorted(set(broken_links(out)))
+    if broken:
+        sys.stderr.write("links that lead nowhere:\n" + "\n".join(f"  {b}" for b in broken) + "\n")
+        return 1
+    sys.stdout.write(f"{out / 'index.html'}\n")
+    return 0
+
+
+def page(name: str, title: str, markdown: str) -> str:
+    """A page with the menu above it."""
+    menu = [f"<b>{t}</b>" if n == name else f'<a href="{n}.html">{t}</a>' for n, t in TITLES.items()]
+    return FRAME.format(title=escape(title), menu="\n".join(menu), body=to_html(markdown))
+
+
+def effects_page() -> str:
+    """Every effect of the library, as its class describes it."""
+    lines = [
+        "# Effects",
+        "",
+        "`close` looks for these by itself. `--effects NAME,NAME` confines it to some. An effect that leaves the same "
+        "trace as another is told from it only by the motion or sensor in the last column; without that the verdict is "
+        "`ambiguous`.",
+        "",
+        "| name | what | at | parameters (unit) | mistaken for, unless the log has |",
+        "|---|---|---|---|---|",
+    ]
+    by_name: dict[str, list[type]] = {}
+    for effect in EFFECTS:
+        by_name.setdefault(effect.name, []).append(effect)
+    for name, variants in by_name.items():
+        first = EFFECTS[EFFECTS.index(variants[0])]
+        kinds = ", ".join(f"{k.name} ({'-' if k.unit == '1' else k.unit})" for k in first.kinds)
+        confounders = "; ".join(f"`{other}`: {what}" for other, what in first.confounders) or "-"
+        lines.append(f"| `{name}` | {first.title} | {first.scope} | {kinds} | {confounders} |")
+    return "\n".join(lines) + "\n"
+
+
+def commands_page() -> str:
+    """Every verb with its help, as the command line prints it."""
+    import typer
+
+    from sysid_btr.cli import EXIT_CODES, app
+
+    command = typer.main.get_command(app)
+    lines = ["# Commands", "", " ".join(EXIT_CODES.split()), ""]
+    for name, verb in sorted(command.commands.items()):  # type: ignore[attr-defined]
+        context = verb.make_context(f"sysid-btr {name}", [], resilient_parsing=True, terminal_width=100)
+        lines += [f"## {name}", "", "```text", verb.get_help(context), "```", ""]
+    return "\n".join(lines)
+
+
+ENTRY = re.compile(r"(?P<name>\*{0,2}[a-z_]\w*(?:, [a-z_]\w*)*) : (?P<text>.+)")
+LONGEST_TYPE = 45
+
+
+def spaced(docstring: str) -> str:
+    """A docstring with the description of each parameter on a line of its own, where it stands beside the name.
+
+    ``name : type`` stays: its description follows, indented, and a type is short and no sentence.
+    """
+    lines = docstring.split("\n")
+    result = []
+    for line, following in zip(lines, [*lines[1:], ""], strict=True):
+        entry = ENTRY.fullmatch(line)
+        if entry is None:
+            result.append(line)
+            continue
+        text = entry["text"]
+        typed = following.startswith("    ") and len(text) < LONGEST_TYPE and text[-1] not in ".,;:"
+        result += [line] if typed else [entry["name"], f"    {text}"]
+    return "\n".join(result)
+
+
+def modules() -> list[str]:
+    """Names of all public modules."""
+    found = (m.name for m in pkgutil.walk_packages(sysid_btr.__path__, "sysid_btr."))
+    return ["sysid_btr", *(n for n in found if "._" not in n and n not in NOT_DOCUMENTED)]
+
+
+def reference_page() -> str:
+    """All modules with what they are for; what most people need first."""
+    lines = ["# API", "", "What `import sysid_btr as sb` offers:", "", "| | |", "|---|---|"]
+    for name in sysid_btr.__all__:
+        # the posterior is a package and a function
+        known, place = getattr(sysid_btr, name), f"sysid_btr.html#{name}"
+        if known is sysid_btr.posterior:
+            known, place = sysid_btr.posterior.posterior, "sysid_btr/posterior.html#posterior"
+        lines.append(f"| [`sb.{name}`](api/{place}) | {first_line(known)} |")
+    for package, names in groupby(modules()[1:], lambda n: ".".join(n.split(".")[:2])):
+        own = list(names)
+        lines += ["", f"## {package}", "", "| | |", "|---|---|"]
+        lines += [f"| [`{n}`](api/{n.replace('.', '/')}.html) | {first_line(import_module(n))} |" for n in own]
+    return "\n".join(lines) + "\n"
+
+
+def first_line(documented: object) -> str:
+    """What a docstring begins with, up to its first empty line."""
+    return " ".join((documented.__doc__ or "").strip().partition("\n\n")[0].split()).replace("|", "\\|")
+
+
+PAGES: dict[str, Callable[[], str]] = {"effects": effects_page, "commands": commands_page, "reference": reference_page}
+
+
+def broken_links(out: Path) -> Iterator[str]:
+    """Links of the guide's pages to files that are not there."""
+    for file in out.glob("*.html"):
+        for link in re.findall(r'href="([^"#:]+)(?:#[^"]*)?"', file.read_text(encoding="utf-8")):
+            if not (out / link).exists():
+                yield f"{file.name}: {link}"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

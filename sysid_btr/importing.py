@@ -1,0 +1,67 @@
+"""Logs of other formats, as ``sysid-btr import`` reads them, for use from Python."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from sysid_btr.io.importers.base import Importer
+    from sysid_btr.io.importers.run import Imported
+    from sysid_btr.models.robot import Robot
+
+    PathLike = str | os.PathLike[str]
+
+
+def import_log(
+    source: PathLike | Sequence[PathLike],
+    *,
+    model: str | Robot | None = None,
+    mapping: PathLike | None = None,
+    units: Mapping[str, str] | None = None,
+    rename: Mapping[str, str] | None = None,
+    mount: Literal["fixed", "free"] | None = None,
+    importer: str | Importer = "auto",
+) -> Imported:
+    """Read a log of another format, and check it.
+
+    >>> imported = import_log("walk.csv", model="leg.xml", units={"position": "deg"})  # doctest: +SKIP
+    >>> study = make_study(load_robot("leg.xml"), [imported.log])  # doctest: +SKIP
+
+    Parameters
+    ----------
+    source : a file, a folder of a bag or dataset, or several of them, which become episodes of one log.
+    model : built-in name, file, or robot: its joints are matched by name, and their ranges checked.
+    mapping : mapping file (TOML); `sysid_btr.io.importers.mapping` describes it.
+    units : channel or column -> unit, as ``--unit``; wins over the mapping.
+    rename : joint of the file -> joint of the model, as ``--rename``.
+    mount : whether the torso was held or could move.
+    importer : name of an importer, one of one's own, or ``"auto"`` to judge by the content.
+
+    Returns
+    -------
+    Imported
+        ``log``; ``remarks`` on what was assumed or left out; ``problems`` of the validation; ``usable``, which is
+        False where a problem is an error.
+
+    Raises
+    ------
+    LogError
+        If a source cannot be read or understood.
+    UsageError
+        If what is told does not fit, or a package is missing.
+    """
+    from sysid_btr.io.importers.mapping import read_map, with_flags
+    from sysid_btr.io.importers.run import import_log as read
+    from sysid_btr.request import known_model
+
+    told = with_flags(
+        read_map(None if mapping is None else Path(mapping)),
+        units=list((units or {}).items()),
+        renames=list((rename or {}).items()),
+        meta={"mount": mount},
+    )
+    paths = [source] if isinstance(source, str | os.PathLike) else list(source)
+    return read(paths, importer=importer, told=told, model=known_model(model))

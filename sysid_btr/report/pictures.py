@@ -1,0 +1,176 @@
+"""The pictures of a run: what is drawn of which outcome, the files they are kept in, and the report made of them.
+
+A picture is ``NAME.png`` in the output folder, and ``dark/NAME.png`` for a dark page; result.json lists the names.
+So the report can be written again from the folder alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sysid_btr.report.html import Picture, render
+from sysid_btr.report.style import on_page
+from sysid_btr.session import OVERLAY, REPORT, RESULT, Folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sysid_btr.diagnosis.closing import Closing
+    from sysid_btr.identify.fit import Fit
+    from sysid_btr.identify.profile import Profile
+    from sysid_btr.posterior.draw import Posterior
+
+    Draw = Callable[[], Figure]
+
+DARK = "dark"
+"""Folder of the pictures for a dark page."""
+
+
+@dataclass(frozen=True)
+class Caption:
+    """What a picture shows.
+
+    Attributes
+    ----------
+    title : its heading.
+    note : how to read it.
+    """
+
+    title: str
+    note: str = ""
+
+
+CAPTIONS: Mapping[str, Caption] = {
+    "overlay": Caption(
+        "Command, log and model where the model was most wrong",
+        "Left the whole log, the part held out shaded; in the middle the seconds in which the plain model is farthest "
+        "off; right what is left of the error there, over twice the sensor's noise.",
+    ),
+    "render": Caption(
+        "Log, model before and model after, side by side",
+        "The log's pose shows through in red where a model is elsewhere; render.gif in the folder moves.",
+    ),
+    "residuals": Caption(
+        "Does what is left follow from something?",
+        "Correlation of the held-out residual with itself (left) and with what was commanded before (right). Inside "
+        "the band it is as in white noise. A curve that leaves the band on the right is motion the model lacks.",
+    ),
+    "convergence": Caption("How the search went"),
+    "predictive": Caption(
+        "What the posterior predicts of held-out data",
+        "Left the seconds in which the data surprise most, right the error over the whole held-out part; 95 % of the "
+        "samples should lie in the band.",
+    ),
+    "corner": Caption(
+        "The posterior",
+        "Every parameter, and every two of them; a slanted ellipse is a combination that the log tells worse than its "
+        "parts. Red lines: the least-squares fit. Dashed: median and 95 % interval.",
+    ),
+    "trace": Caption(
+        "Did the draws converge?",
+        "Mean and central 95 % of the walkers of each independent ensemble, step by step: they should lie on each "
+        "other and have no trend.",
+    ),
+    "profile": Caption(
+        "Profile of the likelihood",
+        "Deviance while the parameter is held and all others are fitted anew; the interval ends where it crosses the "
+        "line. Where it follows the dashed parabola, the standard error says it all.",
+    ),
+    "excite": Caption(
+        "The motion, and what it tells",
+        "Left the commands of the joints that move most, within their bounds; right the standard error that a fit of "
+        "this motion will have, over that of the motion it is compared with: shorter is better.",
+    ),
+    "btr": Caption(
+        "Fitness, its difference between model and robot, and the model, over the iterations",
+        "Dots in the panels of the parameters: all models of an iteration, the better the darker; line: the one kept.",
+    ),
+}
+"""By name of the picture's file, up to the first underscore; ``btr`` for the overlay of a result of that kind."""
+
+
+def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]]:
+    """Names of an outcome's pictures and what draws them, in the order of the report."""
+    from sysid_btr.identify.fit import Fit
+    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.report.figures import figure_of, plot_convergence, plot_overlay, plot_residuals, trace_outcome
+
+    model = outcome.as_fit if isinstance(outcome, Posterior) else outcome
+    traces = trace_outcome(model)
+    yield "overlay", lambda: figure_of(plot_overlay(traces))
+    if isinstance(outcome, Posterior):
+        from sysid_btr.report.posterior import plot_bands, plot_corner, plot_trace
+
+        yield "predictive", lambda: figure_of(plot_bands(outcome))
+        yield "corner", lambda: figure_of(plot_corner(outcome))
+        yield "trace", lambda: figure_of(plot_trace(outcome))
+    yield "residuals", lambda: figure_of(plot_residuals(traces))
+    if isinstance(outcome, Fit):
+        for profile in outcome.profiles:
+            yield f"profile_{file_name(profile.name)}", partial(_profile, profile)
+        if outcome.result.history:
+            yield "convergence", lambda: figure_of(plot_convergence(outcome))
+
+
+def _profile(profile: Profile) -> Figure:
+    from sysid_btr.report.figures import figure_of
+    from sysid_btr.report.posterior import plot_profile
+
+    return figure_of(plot_profile(profile))
+
+
+def keep(folder: Folder, pictures: Iterable[tuple[str, Draw]]) -> list[str]:
+    """Draw pictures for light and dark pages and write them; the names of their files."""
+    names = []
+    dark = folder.within(DARK)
+    for name, draw in pictures:
+        folder.write(f"{name}.png", on_page(draw))
+        dark.write(f"{name}.png", on_page(draw, dark=True))
+        names.append(f"{name}.png")
+    return names
+
+
+def write_report(folder: Folder, result: Mapping[str, Any]) -> Path:
+    """Write report.html from a result and the pictures in the folder.
+
+    Pictures that result.json lists and that are gone are left out.
+    """
+    names = result.get("pictures", [OVERLAY])
+    return folder.write(REPORT, render(result, [p for name in names for p in _picture(folder.path, name, result)]))
+
+
+def rewrite(folder: Folder, result: dict[str, Any], picture: str) -> None:
+    """Write report and result again with one more picture, the second."""
+    from sysid_btr.result import to_json
+
+    result["pictures"] = [*result["pictures"][:1], picture, *result["pictures"][1:]]
+    write_report(folder, result)
+    folder.write(RESULT, to_json(result))
+
+
+def _picture(folder: Path, name: str, result: Mapping[str, Any]) -> Iterator[Picture]:
+    file, dark = folder / name, folder / DARK / name
+    if not file.is_file():
+        return
+    key = "btr" if result["kind"] == "btr" and name == OVERLAY else Path(name).stem.partition("_")[0]
+    caption = CAPTIONS.get(key, Caption(Path(name).stem))
+    title = caption.title
+    if key == "profile":
+        title = f"{title}: {_profiled(name, result)}"
+    yield Picture(title, caption.note, file.read_bytes(), dark.read_bytes() if dark.is_file() else None)
+
+
+def _profiled(name: str, result: Mapping[str, Any]) -> str:
+    """The parameter whose profile a file shows."""
+    stem = Path(name).stem.removeprefix("profile_")
+    return next((p["name"] for p in result.get("profiles", []) if file_name(p["name"]) == stem), stem)
+
+
+def file_name(parameter: str) -> str:
+    """A parameter's name as a part of a file's."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", parameter).strip("_")

@@ -1,0 +1,105 @@
+"""README and guide say what is true: commands and flags that exist, every verdict, every effect, pages that link."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import get_args
+
+import pytest
+import typer
+
+import sysid_btr
+from sysid_btr.cli import app
+from sysid_btr.diagnosis.closing import Verdict
+from sysid_btr.effects.library import effect_names
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
+
+
+@pytest.fixture(scope="module")
+def build() -> ModuleType:
+    """The generator of the documentation."""
+    pytest.importorskip("pdoc", reason="the documentation needs the extra `dev`")
+    spec = spec_from_file_location("docs_build", ROOT / "docs" / "build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules["docs_build"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
+    """Verb and flags of every command line on a page."""
+    for text in re.findall(r"sysid-btr ([a-z]+[^\n`#]*)", page.read_text(encoding="utf-8")):
+        words = shlex.split(text.replace("'", '"') if text.count("'") % 2 else text)
+        yield words[0], [w.partition("=")[0] for w in words[1:] if w.startswith("--")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_every_command_of_a_page_exists(page: Path) -> None:
+    verbs = typer.main.get_command(app).commands
+    found = list(commands(page))
+    assert found or page.name == "limits.md"
+    for verb, flags in found:
+        assert verb in verbs
+        known = {option for parameter in verbs[verb].params for option in parameter.opts} | {"--help"}
+        assert set(flags) <= known, (page.name, verb, flags)
+
+
+def test_every_name_of_the_package_that_a_page_uses_exists() -> None:
+    for page in PAGES:
+        for name in re.findall(r"\bsb\.([a-z_]+)", page.read_text(encoding="utf-8")):
+            assert name in sysid_btr.__all__, (page.name, name)
+
+
+def test_every_verdict_is_explained() -> None:
+    text = (ROOT / "docs" / "guide" / "verdicts.md").read_text(encoding="utf-8")
+    for verdict in get_args(Verdict):
+        assert f"## `{verdict}`" in text
+
+
+def test_pages_made_from_code_hold_all_of_it(build: ModuleType) -> None:
+    effects, verbs = build.effects_page(), build.commands_page()
+    for name in effect_names():
+        assert f"| `{name}` |" in effects
+    for verb in typer.main.get_command(app).commands:
+        assert f"## {verb}\n" in verbs
+    reference = build.reference_page()
+    for name in sysid_btr.__all__:
+        assert f"`sb.{name}`" in reference
+
+
+def test_pages_link_to_pages(build: ModuleType, tmp_path: Path) -> None:
+    for name, title in build.TITLES.items():
+        if name not in build.PAGES:
+            text = (ROOT / "docs" / "guide" / f"{name}.md").read_text(encoding="utf-8")
+            (tmp_path / f"{name}.html").write_text(build.page(name, title, text))
+        else:
+            (tmp_path / f"{name}.html").touch()
+    assert {b for b in build.broken_links(tmp_path) if "api/" not in b} == set()
+    (tmp_path / "limits.html").unlink()
+    assert "index.html: limits.html" in set(build.broken_links(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ("log : commands and times.", "log\n    commands and times."),
+        ("path : path-like\n    Where to.", "path : path-like\n    Where to."),
+        (
+            "a, b : the last fraction of each log, which is not fitted, or\n    others.",
+            "a, b\n    the last fraction of each log, which is not fitted, or\n    others.",
+        ),
+        ("No entry: a sentence.", "No entry: a sentence."),
+    ],
+)
+def test_a_description_beside_a_name_is_no_type(build: ModuleType, given: str, wanted: str) -> None:
+    assert build.spaced(given) == wanted
