@@ -26,7 +26,7 @@ from sysid_btr.effects.library import select_effects
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift
+from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift, walking_error
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, paired_t, refit, robust_refit, shorten
 from sysid_btr.identify.scores import score
@@ -37,8 +37,13 @@ from sysid_btr.models.robot import body_names, joint_names, servo_joints
 if TYPE_CHECKING:
     from numpy.random import Generator
 
+    from sysid_btr.io.log import Log
+
 SCAN_SECONDS = 15.0
 """Part of each log that is scanned; the leading hypotheses are refitted on more."""
+GLANCE_SECONDS, GLANCED = 2.5, 150
+"""Part of each walk on which all questions are asked, and how many of them then on the part that is scanned: on a free
+base every question is a simulation of its own."""
 REFIT_SECONDS = 20.0
 LADDER_SECONDS = 6.0
 """Part of each log on which it is decided where a refit begins, if there are more than ..."""
@@ -100,6 +105,7 @@ def close(
     journal: Journal | None = None,
     progress: Progress = silent,
     start: FloatArray | None = None,
+    worth: float = TRACE,
 ) -> Closing:
     """Name the effects that a model lacks.
 
@@ -111,6 +117,9 @@ def close(
     rng : for estimators that draw; not used by the default ones.
     journal, progress : see `sysid_btr.estimators`.
     start : (p,) where the declared parameters begin; default the nominal values.
+    worth : fraction of some column's first excess over the floor that an effect must remove. The shapes of effects
+        that are found are a little wrong, and much else would mend that; a smaller fraction builds a longer ladder
+        for prediction, whose last rungs mean less.
 
     Returns
     -------
@@ -153,7 +162,7 @@ def close(
             replays += trials[-1][1].evaluations
         if not candidates or state.effects:
             candidates += _candidates(state.fitted, trials)
-        winner = _choose(state.fitted, [t for t in trials if _worth(before, state.fitted, t[1])])
+        winner = _choose(state.fitted, [t for t in trials if _worth(before, state.fitted, t[1], worth)])
         if winner is None:
             break
         hypothesis, fitted = winner
@@ -202,7 +211,7 @@ def close(
     if later is not None:
         # what is missing shows only after the fitted part: fit more of the log, hold out what is left
         again = replace(later, numerics=first.study.numerics, inflation={})
-        return close(again, parameters, effects=effects, rng=rng, progress=progress, start=start)
+        return close(again, parameters, effects=effects, rng=rng, progress=progress, start=start, worth=worth)
     named = _named(study, state, before, final_estimates[count:], declared, candidates) if state.effects else ()
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
@@ -260,16 +269,23 @@ def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[
     for effect in effects:
         if effect.name.startswith("foot_") and not free:
             continue
+        if effect.needs == "enabled" and not any(_switched(log) for log in study.train):
+            continue
         result.append(effect)
     return tuple(result)
+
+
+def _switched(log: Log) -> bool:
+    """Whether a drive is off for a part of the log."""
+    return any(bool(np.any(v == 0)) for name, v in log.channels.items() if name.startswith("enabled."))
 
 
 def _scan(
     study: Study, state: _State, library: Sequence[type[Effect]]
 ) -> tuple[list[Trace], FloatArray]:
-    short = shorten(study, SCAN_SECONDS)
-    problem = short.train_problem(state.fitted.modifiers, state.fitted.values)
-    residual, jacobian = linearise(problem, state.fitted.values, step=study.stencil)
+    values = state.fitted.values
+    problem = shorten(study, SCAN_SECONDS).train_problem(state.fitted.modifiers, values)
+    residual, jacobian = linearise(problem, values, step=study.stencil)
     places = {
         "joint": joint_names(study.robot),
         "servo": servo_joints(study.robot),
@@ -277,7 +293,7 @@ def _scan(
         "robot": ("robot",),
     }
     asked: list[Question] = questions(library, places, study.scales)
-    asked += proposals(study, problem, state.fitted.values, residual, library)
+    asked += proposals(study, problem, values, residual, library)
     # an effect already at a place is not asked for again; it is refitted with everything else
     present = {(type(e), p) for e in state.effects for p in e.places}
     split = {p for e in state.effects if e.structural for p in e.places}
@@ -286,7 +302,11 @@ def _scan(
         for q in asked
         if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
     ]
-    return scan(problem, state.fitted.values, residual, jacobian, asked, study.scales), residual
+    if study.free and len(asked) > GLANCED:
+        glance = shorten(study, GLANCE_SECONDS).train_problem(state.fitted.modifiers, values)
+        seen = scan(glance, values, *linearise(glance, values, step=study.stencil), asked, study.scales)
+        asked = [t.question for t in seen[:GLANCED]]
+    return scan(problem, values, residual, jacobian, asked, study.scales), residual
 
 
 def _try(
@@ -394,7 +414,7 @@ def _another(hypothesis: Hypothesis, simple: Hypothesis) -> bool:
     return hypothesis.effect.name != simple.effect.name and simple.effect.name not in hypothesis.effect.includes
 
 
-def _worth(first: Fitted, before: Fitted, after: Fitted) -> bool:
+def _worth(first: Fitted, before: Fitted, after: Fitted, least: float) -> bool:
     """Whether an effect removes more than a trace of what some column had above its floor at first.
 
     Where effects of a real robot have been found, their shapes are a little wrong, and much else would help.
@@ -402,7 +422,7 @@ def _worth(first: Fitted, before: Fitted, after: Fitted) -> bool:
     if len(first.columns) != len(before.columns):
         return True
     excess = np.maximum(first.columns - 1, TRACE)
-    return bool(np.nanmax((before.columns - after.columns) / excess) >= TRACE)
+    return bool(np.nanmax((before.columns - after.columns) / excess) >= least)
 
 
 def _accepted(before: Fitted, after: Fitted) -> bool:
@@ -543,11 +563,14 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
         residual, jacobian = linearise(problem, fitted.values, step=study.stencil)
         jacobian = np.nan_to_num(jacobian)
         shift = numerics_shift(problem, fitted.values, jacobian, residual)
+        if study.free:
+            shift = np.hypot(shift, walking_error(study, problem, fitted.values, jacobian, residual))
         found = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift)
         bare = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks)
         told = np.array([e.identifiable != "no" for e in bare])
         worst = np.max(np.abs(shift[told]) / np.maximum([e.std for e in bare], 1e-300)[told], initial=0.0)
-        if worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or refinement == MAX_REFINEMENTS:
+        settled = worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or study.free
+        if settled or refinement == MAX_REFINEMENTS:
             break
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, fitted.modifiers, fitted.values, iterations=4))
@@ -559,25 +582,34 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
 def _told_apart_from_nothing(
     study: Study, state: _State, declared: tuple[Modifier, ...], found: Sequence[Estimate]
 ) -> _State | None:
-    """The model without effects whose amounts may all be nothing; None where there are none."""
-    column = sum(len(m.parameters) for m in declared)
-    kept, columns = [], list(range(column))
-    for i, effect in enumerate(state.effects):
+    """The model without effects whose amounts may all be nothing, the least sure first; None where there are none.
+
+    Only what held-out data do not miss is dropped: of two effects that a log tells together but not apart, one stays.
+    """
+    offset = sum(len(m.parameters) for m in declared)
+    doubtful: list[tuple[float, Effect]] = []
+    column = offset
+    for effect in state.effects:
         size, kinds = len(effect.parameters), len(effect.kinds)
-        mains = zip(
-            found[column + effect.main : column + size : kinds], effect.neutral[effect.main :: kinds], strict=True
-        )
-        if not all(e.ci95[0] <= nothing <= e.ci95[1] for e, nothing in mains):
-            kept.append(i)
-            columns += range(column, column + size)
+        mains = found[column + effect.main : column + size : kinds]
+        nothing = effect.neutral[effect.main :: kinds]
+        if all(e.ci95[0] <= n <= e.ci95[1] for e, n in zip(mains, nothing, strict=True)):
+            sure = max(abs(e.value - n) / max(e.std, 1e-300) for e, n in zip(mains, nothing, strict=True))
+            doubtful.append((sure, effect))
         column += size
-    if len(kept) == len(state.effects) or not kept:
-        return None
-    effects = tuple(state.effects[i] for i in kept)
-    fitted = refit(study, (*declared, *effects), state.fitted.values[columns], polish=True)
-    if fitted.misfit > state.fitted.misfit + NEAR:
-        return None
-    return _State(fitted, effects, tuple(state.rivals[i] for i in kept))
+    result: _State | None = None
+    now = state
+    for _, effect in sorted(doubtful, key=lambda item: item[0]):
+        if len(now.effects) == 1:
+            break
+        at = now.effects.index(effect)
+        first = offset + sum(len(e.parameters) for e in now.effects[:at])
+        values = np.delete(now.fitted.values, slice(first, first + len(effect.parameters)))
+        effects = (*now.effects[:at], *now.effects[at + 1 :])
+        fitted = refit(study, (*declared, *effects), values, polish=True)
+        if fitted.misfit <= state.fitted.misfit + NEAR:
+            result = now = _State(fitted, effects, (*now.rivals[:at], *now.rivals[at + 1 :]))
+    return result
 
 
 def _named_only_in(before: _State, after: _State) -> tuple[str, ...]:

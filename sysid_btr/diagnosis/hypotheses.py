@@ -57,7 +57,7 @@ class Hypothesis:
 
     def __str__(self) -> str:
         places = ", ".join(self.places) if len(self.places) < 5 else f"{len(self.places)} places"
-        return f"{self.effect.name} at {places}"
+        return f"{self.effect.label or self.effect.name} at {places}"
 
 
 def form_hypotheses(traces: Sequence[Trace], residuals: int, most: int) -> list[Hypothesis]:

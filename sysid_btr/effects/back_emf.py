@@ -26,6 +26,7 @@ class BackEmf(Effect):
     scope: ClassVar = "servo"
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "limit")
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", 0.0, 0.0, 10.0, 0.05),)
+    needs: ClassVar[str] = "enabled"
     yields_to: ClassVar[tuple[str, ...]] = ("viscous_damping",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("viscous_damping", "free motion with the drive switched off, or a logged effort"),

@@ -44,6 +44,7 @@ class LoadFrictionLarger(LoadFriction):
 
     title: ClassVar[str] = "friction per unit of the torque that enters the gear"
     variant: ClassVar[str] = "larger"
+    label: ClassVar[str] = "load_friction.larger"
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         entering = np.maximum(np.abs(step.drive[:, index]), np.abs(step.load[:, index]))
@@ -56,6 +57,7 @@ class LoadFrictionQuadratic(LoadFriction):
 
     title: ClassVar[str] = "friction per unit of squared load"
     variant: ClassVar[str] = "quadratic"
+    label: ClassVar[str] = "load_friction.quadratic"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("curvature", "1/Nm", 0.0, 0.0, 1.0, 0.1),)
 
     @classmethod
@@ -73,6 +75,7 @@ class LoadFrictionStribeck(LoadFriction):
 
     title: ClassVar[str] = "friction per unit of load that falls with speed"
     variant: ClassVar[str] = "stribeck"
+    label: ClassVar[str] = "load_friction.stribeck"
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("ratio", "1", 0.0, 0.0, 0.9, 0.08),
         Kind("static", "1", 0.0, 0.0, 0.9, 0.08),
