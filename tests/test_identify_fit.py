@@ -17,7 +17,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.identify.fit import Fit, fit
+from sysid_btr.identify.fit import Fit, fewest_to_hold, fit
 from sysid_btr.identify.intervals import Estimate, covariance, estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
@@ -144,6 +144,58 @@ def test_covariance_is_infinite_for_two_parameters_that_do_the_same() -> None:
     found = np.diag(covariance(jacobian, rng.standard_normal(400), np.arange(400) // 10))
     assert np.all(np.isinf(found[:2]))
     assert found[2] == pytest.approx(1 / (b @ b), rel=0.5)
+
+
+FEW, LONG, MANY = 17, 40, 8
+
+
+@pytest.mark.parametrize("memory", [1, 20], ids=["white", "correlated"])
+def test_intervals_of_short_logs_with_many_parameters_hold_the_truth(memory: int) -> None:
+    """Half a log of 17 stretches is chance where 8 parameters are fitted: neither too narrow for it nor too wide."""
+    rng = np.random.default_rng(11)
+    blocks = np.repeat(np.arange(FEW), LONG)
+    parameters = [Parameter(f"mass:{i}", "1", 0.0, -1e3, 1e3, 10.0) for i in range(MANY)]
+    inside, width, trials = 0, [], 120
+    for _ in range(trials):
+        jacobian = rng.standard_normal((FEW * LONG, MANY))
+        noise = rng.standard_normal(FEW * LONG)
+        if memory > 1:  # neither what moves nor what errs forgets quickly
+            jacobian, noise = (
+                np.repeat(rng.standard_normal((FEW * LONG // memory, *size)), memory, axis=0) for size in ((MANY,), ())
+            )
+        left = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
+        found = estimates(parameters, left, jacobian, noise - jacobian @ left, blocks)
+        inside += sum(covers(e, 0.0) for e in found)
+        scale = np.sqrt(memory * np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+        width += [(e.ci95[1] - e.ci95[0]) / (2 * 1.96 * s) for e, s in zip(found, scale, strict=True)]
+    assert 0.92 <= inside / (trials * MANY) <= 0.98
+    assert np.median(width) == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_direction_that_a_model_gets_wrong_is_not_averaged_away() -> None:
+    rng = np.random.default_rng(12)
+    blocks = np.repeat(np.arange(FEW), LONG)
+    jacobian = rng.standard_normal((FEW * LONG, MANY))
+    jacobian[:, 0] = np.repeat(rng.standard_normal(FEW), LONG)
+    residual = rng.standard_normal(FEW * LONG) + 1.5 * np.repeat(rng.standard_normal(FEW), LONG)
+    residual -= jacobian @ np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+    white = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    widened = np.sqrt(np.diag(covariance(jacobian, residual, blocks))) / white
+    assert widened[0] > 5.0
+    assert np.all(widened[1:] < 0.6 * widened[0])
+
+
+def test_of_what_is_told_only_together_as_few_as_need_be_are_held() -> None:
+    rng = np.random.default_rng(13)
+    a, b = rng.standard_normal((2, 400))
+    jacobian = np.column_stack([a, a + 1e-3 * b, np.zeros(400), 30 * b])
+    parameters = [Parameter(f"mass:{n}", "1", 1.0, 0.3, 3.0, 0.1) for n in "abcd"]
+    found = estimates(parameters, np.ones(4), jacobian, rng.standard_normal(400), np.arange(400) // 10)
+    assert [e.identifiable for e in found] == ["no", "no", "no", "yes"]
+    held = fewest_to_hold(jacobian, found)
+    assert held[:2].sum() == 1  # the other one is then told
+    assert held[2]
+    assert not held[3]
 
 
 def test_an_unseen_parameter_is_not_identifiable_and_says_why() -> None:

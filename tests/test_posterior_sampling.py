@@ -276,7 +276,8 @@ def test_correlated_residuals_widen_the_direction_that_they_concern() -> None:
     white = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     widened = found.flat.std(axis=0) / white
     assert widened[0] == pytest.approx(np.sqrt(10), rel=0.15)
-    assert widened[1] == pytest.approx(1.0, abs=0.15)
+    # the other one only by what shrinking lends to it: too wide, never too narrow
+    assert 0.95 < widened[1] < 1.35
 
 
 def test_where_the_model_is_linear_the_posterior_has_the_sandwich_covariance() -> None:

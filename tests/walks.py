@@ -53,7 +53,8 @@ def record_walk(
     """
     spec = load_robot("nao").make_spec()
     spec.option.timestep = STEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # a truth of first order in the step would pass for a servo with another damping
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     if edit is not None:
         edit(spec)

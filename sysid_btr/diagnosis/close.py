@@ -75,6 +75,9 @@ STEP_T = 3.0
 """... with this paired t over half-second stretches of held-out data."""
 STEP_CERTAIN = 0.3
 """Fraction of the held-out chi2 of a column whose loss needs no test."""
+WHOLE_EXCESS, WHOLE_LEFT, WHOLE_HARM = 2.0, 0.03, 0.01
+"""Excess of a column's chi2 on fitted data of which an effect must leave less than this fraction, without harm to
+held-out data, to be added although these do not show it."""
 EXPLAINED = 0.85
 """Fraction of the held-out excess that must be gone for effects to be named."""
 AT_FLOOR = 1.10
@@ -397,7 +400,7 @@ def _choose(
         if event[1].misfit_everywhere < min(lasting, default=np.inf) - SIMPLER:
             return event
     if not sound:
-        return None
+        return _choose_once(before, trials)
     best = min(f.misfit for _, f in sound)
     near = [(h, f) for h, f in sound if f.misfit <= best + SIMPLER]
     named = {h.effect.name for h, _ in near}
@@ -407,6 +410,18 @@ def _choose(
     others = [(h, f) for h, f in near if _another(h, simplest[0]) and f.misfit < simplest[1].misfit]
     beyond = [(h, f) for h, f in others if paired_t(f, simplest[1]) > STEP_T]
     return min(beyond or [simplest], key=lambda t: (t[0].size, t[1].misfit))
+
+
+def _choose_once(
+    before: Fitted, trials: Sequence[tuple[Hypothesis, Fitted]]
+) -> tuple[Hypothesis, Fitted] | None:
+    """The simplest hypothesis that leaves nothing of what a column shows in its fitted part alone."""
+    whole = [(h, f) for h, f in trials if _accepted_wholly(before, f)]
+    if not whole:
+        return None
+    best = min(f.misfit_everywhere for _, f in whole)
+    near = [(h, f) for h, f in whole if f.misfit_everywhere <= best + SIMPLER]
+    return min(near, key=lambda t: (t[0].size, t[1].misfit_everywhere))
 
 
 def _another(hypothesis: Hypothesis, simple: Hypothesis) -> bool:
@@ -432,13 +447,22 @@ def _accepted(before: Fitted, after: Fitted) -> bool:
     t = paired_t(after, before)
     # an effect that acts in few stretches (a limit, a push) has a small t however large it is there
     certain = t > STEP_T or max(drop, local) > STEP_CERTAIN
-    return (drop > STEP_GAIN or local > 5 * STEP_GAIN) and certain and after.train < before.train
+    # a joint with something of its own must not outweigh all others
+    fitted = after.train < before.train or after.misfit_fitted < before.misfit_fitted - SIMPLER
+    return (drop > STEP_GAIN or local > 5 * STEP_GAIN) and certain and fitted
 
 
 def _accepted_once(before: Fitted, after: Fitted) -> bool:
     """Whether what happens once, and so cannot be held out, removes enough where it happened."""
     local = float(np.max((before.train_columns - after.train_columns) / before.train_columns))
     return bool(np.isfinite(after.holdout)) and local > STEP_CERTAIN and after.holdout < 1.05 * before.holdout
+
+
+def _accepted_wholly(before: Fitted, after: Fitted) -> bool:
+    """Whether all of a column's excess is gone, where held-out data show neither the excess nor any harm."""
+    excess, left = before.train_columns - 1, after.train_columns - 1
+    whole = (excess > WHOLE_EXCESS) & (left < WHOLE_LEFT * excess)
+    return bool(np.any(whole)) and after.holdout < (1 + WHOLE_HARM) * before.holdout
 
 
 def _rivals(
@@ -490,7 +514,7 @@ def _prune(
         trial = refit(shorten(study, REFIT_SECONDS), (*declared, *others), values)
         trial = judge(study, trial.modifiers, trial.values, trial.evaluations)
         spent += trial.evaluations
-        if not _accepted(trial, state.fitted):
+        if not (_accepted(trial, state.fitted) or _accepted_wholly(trial, state.fitted)):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
             state = _State(trial, others, state.rivals[:at] + state.rivals[at + 1 :])
     for effect in state.effects if len(state.effects) > 1 else ():

@@ -15,10 +15,12 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, si
 from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.identify.intervals import Estimate, estimates
+from sysid_btr.identify.deferred import corrected, deferred_fit
+from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, estimates
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
+from sysid_btr.identify.walk import repeated_error
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
@@ -55,7 +57,7 @@ class Fit:
     values : (p,) the estimates' values.
     nominal, before : scores of the plain and of the fitted model on fitted and held-out data.
     result : what the estimator returned.
-    numerics_shift : (p,) change of the estimates when the step is halved.
+    numerics_shift : (p,) change of the estimates when the step is halved; on walks with `walking_error`.
     replays : candidates simulated.
     seconds : wall time.
     profiles : likelihood along single parameters, where it was asked for (`identify.profile`).
@@ -150,8 +152,13 @@ def fit(
         problem = study.train_problem(modifiers, coarse.values)
     if distance is not None and isinstance(estimator, LeastSquares):
         raise UsageError("lsq minimises squared residuals: for another distance choose ga, cmaes or nlopt:ALGORITHM")
-    goal = problem if distance is None else DistanceProblem(problem, distance)
-    result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
+    if study.free and isinstance(estimator, LeastSquares):
+        result = deferred_fit(
+            problem, study.rough, estimator, rng=rng, budget=budget, journal=journal, progress=progress
+        )
+    else:
+        goal = problem if distance is None else DistanceProblem(problem, distance)
+        result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
     replays = result.evaluations + rough
     step = study.stencil
     values, jacobian, residual = _at_optimum(problem, result, step)
@@ -173,11 +180,11 @@ def fit(
         replays += polished.evaluations
         values, jacobian, residual = _at_optimum(problem, polished, step)
     if study.free:
-        shift = np.hypot(shift, placement_shift(study, modifiers, values))
+        shift = np.hypot(shift, walking_error(study, problem, values, jacobian, residual))
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift)
     extra = 0
     if isinstance(estimator, LeastSquares):
-        values, found, extra = hold_unidentifiable(problem, values, found)
+        values, found, extra = hold_unidentifiable(problem, values, found, jacobian)
     return Fit(
         study=study,
         modifiers=modifiers,
@@ -217,7 +224,7 @@ def settled_refit(study: Study, modifiers: tuple[Modifier, ...], start: FloatArr
     study = replace(study, numerics=study.rough)
     first = best_start(study, modifiers, contact_starts(modifiers, start))
     coarse = refit(study, modifiers, first, iterations=5)
-    study = study.settled(modifiers, coarse.values, held=False)
+    study = study.settled(modifiers, coarse.values, held=False, anew=False)
     again = refit(study, modifiers, coarse.values, iterations=3)
     study = replace(study.settled(modifiers, again.values), numerics=numerics)
     return study, judge(study, modifiers, again.values, again.evaluations + coarse.evaluations)
@@ -264,6 +271,14 @@ def numerics_shift(
     return -np.asarray(np.linalg.lstsq(jacobian, fine - residual, rcond=1e-6)[0])
 
 
+def walking_error(
+    study: Study, problem: ReplayProblem, values: FloatArray, jacobian: FloatArray, residual: FloatArray
+) -> FloatArray:
+    """Standard deviation of estimates from walks, (p,), beyond that of pieces of the log that are independent."""
+    placed = placement_shift(study, problem.modifiers, values)
+    return np.hypot(placed, repeated_error(problem, jacobian, residual))
+
+
 def placement_shift(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray) -> FloatArray:
     """Change of the estimates, (p,), to first order, when the windows of walks begin elsewhere.
 
@@ -271,7 +286,7 @@ def placement_shift(study: Study, modifiers: tuple[Modifier, ...], values: Float
     """
     relaid = study.relaid().settled(modifiers, values, held=False)
     problem = relaid.train_problem(modifiers, values)
-    residual, jacobian = linearise(problem, values, step=study.stencil)
+    residual, jacobian = linearise(corrected(problem, study.rough, values), values, step=study.stencil)
     if not np.isfinite(jacobian).all():
         return np.full(len(values), np.inf)
     span = problem.upper - problem.lower
@@ -289,14 +304,16 @@ def _at_optimum(
 
 
 def hold_unidentifiable(
-    problem: ReplayProblem, values: FloatArray, found: tuple[Estimate, ...]
+    problem: ReplayProblem, values: FloatArray, found: tuple[Estimate, ...], jacobian: FloatArray
 ) -> tuple[FloatArray, tuple[Estimate, ...], int]:
     """Hold what the log cannot tell at its nominal value, and refit the rest: values, estimates, evaluations.
 
-    The intervals of the others stay those of the joint fit, so they still cover whatever value the held
-    parameters really have.
+    Of parameters that the log tells only together, as few are held as it takes to tell the others: to hold them all
+    would contradict what is known of them together. The intervals stay those of the joint fit, about its own
+    estimates, so they still cover whatever value the held parameters really have. Nothing is held where that predicts
+    the log worse: the intervals are those of a linear model, and of the model's own error where there is one.
     """
-    blind: BoolArray = np.array([e.identifiable == "no" for e in found])
+    blind = fewest_to_hold(jacobian, found)
     if not blind.any() or blind.all():
         return values, found, 0
     held = values.copy()
@@ -305,18 +322,41 @@ def hold_unidentifiable(
     result = LeastSquares().fit(
         conditional, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
     )
-    values = conditional.complete(result.x[None])[0]
+    complete = conditional.complete(result.x[None])[0]
+    free_loss, held_loss = problem.loss(np.stack([values, complete]))
+    if not held_loss <= free_loss * WORSE:
+        return values, found, result.evaluations + 2
+    values = complete
     moved = []
-    for estimate, value in zip(found, values, strict=True):
-        half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
-        low, high = max(value - half, estimate.bounds[0]), min(value + half, estimate.bounds[1])
-        reason = estimate.reason
-        if estimate.identifiable == "no":
-            reason = f"{reason}; held at its nominal value"
-            low, high = estimate.bounds
+    for estimate, value, fixed in zip(found, values, blind, strict=True):
+        low, high = estimate.bounds if estimate.identifiable == "no" else estimate.ci95
+        reason = f"{estimate.reason}; held at its nominal value" if fixed else estimate.reason
         span = estimate.bounds[1] - estimate.bounds[0]
         at_bound = bool(min(value - estimate.bounds[0], estimate.bounds[1] - value) <= 1e-6 * span)
-        moved.append(
-            replace(estimate, value=float(value), ci95=(low, high), reason=reason, at_bound=at_bound)
-        )
+        ci95 = (min(low, float(value)), max(high, float(value)))
+        moved.append(replace(estimate, value=float(value), ci95=ci95, reason=reason, at_bound=at_bound))
     return values, tuple(moved), result.evaluations
+
+
+WORSE = 1.01
+"""Ratio of losses beyond which nominal values are worse than estimates, whatever the intervals of these say."""
+
+
+def fewest_to_hold(jacobian: FloatArray, found: Sequence[Estimate]) -> BoolArray:
+    """Parameters (p,) that the log cannot tell even where the others of them are held."""
+    blind: BoolArray = np.array([e.identifiable == "no" for e in found])
+    span = np.array([e.bounds[1] - e.bounds[0] for e in found])
+    norm = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(norm > 0, norm, 1.0)
+    normal = scaled.T @ scaled
+    held: BoolArray = blind & (norm == 0)
+    while (blind & ~held).any():
+        free = np.flatnonzero(~held)
+        values, vectors = np.linalg.eigh(normal[np.ix_(free, free)])
+        variance = (vectors**2 / np.maximum(values, RANK * max(values[-1], 1e-300))).sum(axis=1)
+        unsure = np.where(blind[free], np.sqrt(variance) / (norm[free] * span[free]), 0.0)
+        worst = int(np.argmax(unsure))
+        if unsure[worst] <= NOT_IDENTIFIABLE:
+            break
+        held[free[worst]] = True
+    return held

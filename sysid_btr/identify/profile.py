@@ -20,7 +20,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.intervals import RANK, covariance
+from sysid_btr.identify.intervals import RANK, spread
 from sysid_btr.identify.refit import walking
 from sysid_btr.objectives.problem import Conditional
 
@@ -156,12 +156,12 @@ def profile_curve(
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=RANK, hermitian=True)
     white = float(inverse[index, index] / size[index] ** 2)
-    std = float(np.hypot(np.sqrt(covariance(jacobian, residual, blocks)[index, index]), shift))
+    covariance, dof = spread(jacobian, residual, blocks)
+    std = float(np.hypot(np.sqrt(covariance[index, index]), shift))
     known = np.isfinite(std) and std < span
     # a parabola of width std must give the interval of the standard error
     share = white / std**2 if known else 1.0
-    dof = max(len(np.unique(blocks)) - 1, 5)
-    threshold = float(student.ppf(0.975, dof)) ** 2
+    threshold = float(student.ppf(0.975, dof[index])) ** 2
     step = np.sqrt(BEYOND * threshold) * min(std, span) / (points // 2) if known else span / (points - 1)
     follow = _responses(normal, index)
     quick = replace(estimator, confirm=False, max_iterations=_ITERATIONS, tolerance=1e-5)

@@ -10,6 +10,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
+from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.study import WIDE_STEP, Study
 from sysid_btr.identify.walk import Walk
 from sysid_btr.models.modifier import Modifier
@@ -61,6 +62,11 @@ class Fitted:
         return float(np.sum(np.log(np.maximum(self.holdout_columns, CLEAN))))
 
     @property
+    def misfit_fitted(self) -> float:
+        """The same over fitted data."""
+        return float(np.sum(np.log(np.maximum(self.train_columns, CLEAN))))
+
+    @property
     def misfit_everywhere(self) -> float:
         """The same over all data, for what happens once and cannot be held out."""
         return float(np.sum(np.log(np.maximum(self.columns, CLEAN))))
@@ -83,9 +89,11 @@ def refit(
     )
     if study.free:
         estimator = walking(estimator)
-    result = estimator.fit(
-        problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
-    )
+    rng, budget, journal = np.random.default_rng(0), Budget(), Journal()
+    if study.free and study.numerics != study.rough:
+        result = deferred_fit(problem, study.rough, estimator, rng=rng, budget=budget, journal=journal, progress=silent)
+    else:
+        result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=silent)
     return judge(study, modifiers, result.x, evaluations=result.evaluations)
 
 

@@ -145,17 +145,20 @@ class Study:
         """Finite-difference step, fraction of a parameter's range: wide where impacts roughen the objective."""
         return WIDE_STEP if self.free else LeastSquares.central_step
 
-    def settled(self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True) -> Study:
+    def settled(
+        self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True, anew: bool = True
+    ) -> Study:
         """The study with the starts of its windows moved to where the data want them under these parameters.
 
-        `held` says whether those of held-out windows too, which only judge.
+        `held` says whether those of held-out windows too, which only judge; `anew` whether known derivatives with
+        respect to starts are taken again.
         """
         def settled(log: Log, begin: float) -> Log:
             if not isinstance(log, Walk):
                 return log
             log = log.only(begin)
             episode = self._episode(log, modifiers, self.channels, begin, np.inf)
-            return settle(log, episode.replay, episode.targets, values, self.rough)
+            return settle(log, episode.replay, episode.targets, values, self.rough, anew=anew)
 
         return replace(
             self,

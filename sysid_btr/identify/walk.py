@@ -12,13 +12,14 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.base_state.estimate import BaseState, estimate_base
 from sysid_btr.base_state.feet import base_body, touching_bodies
 from sysid_btr.errors import LogError
+from sysid_btr.identify.intervals import covariance, spread
 from sysid_btr.io.log import Log
 from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.marginal import Marginal, projections, sensitivity
 from sysid_btr.objectives.noise import noise_floor
-from sysid_btr.objectives.problem import Episode
+from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
 from sysid_btr.replay.engine import Numerics, Replay, compile_model, make_index
 from sysid_btr.replay.quiet import quiet
@@ -325,7 +326,15 @@ def covered(walk: Walk) -> BoolArray:
     return result
 
 
-def settle(walk: Walk, replay: Replay, targets: tuple[Target, ...], values: FloatArray, rough: Numerics) -> Walk:
+def settle(
+    walk: Walk,
+    replay: Replay,
+    targets: tuple[Target, ...],
+    values: FloatArray,
+    rough: Numerics,
+    *,
+    anew: bool = True,
+) -> Walk:
     """Move the starts of a walk's windows to where the data want them, and find what they leave open.
 
     One Gauss-Newton step for each window, with the reconstructed state as its prior.
@@ -335,15 +344,18 @@ def settle(walk: Walk, replay: Replay, targets: tuple[Target, ...], values: Floa
     walk, replay, targets : of the same episode.
     values : (p,) the candidate.
     rough : integrator and step for derivatives with respect to the starts.
+    anew : whether derivatives that are known are taken again.
     """
     assert isinstance(replay, WindowReplay)
     assert walk.windows is not None
     windows = walk.windows
     w, coordinates = windows.std.shape
     before = walk.marginal
-    marginal = respond(replace(replay, numerics=rough), values)
-    if before is not None:
-        marginal = replace(marginal, shift=before.shift)
+    marginal = before
+    if anew or marginal is None:
+        marginal = respond(replace(replay, numerics=rough), values)
+        if before is not None:
+            marginal = replace(marginal, shift=before.shift)
     # sigma of the noise itself: how well a window is explained must not depend on what others leave
     plain = tuple(replace(t, sigma=t.noise) for t in targets)
     episode = Episode(replay, plain, marginal)
@@ -383,6 +395,81 @@ def weigh(walk: Walk, replay: Replay, targets: tuple[Target, ...], values: Float
     chi2 = np.nan_to_num(chi2, nan=np.inf)
     usual = max(float(np.quantile(chi2, USUAL)), 1.0)
     return replace(walk, marginal=replace(plain, weight=np.clip(np.sqrt(usual / chi2), LEAST_WEIGHT, 1.0)))
+
+
+def repeated_error(problem: ReplayProblem, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """Standard deviation of estimates, (p,), from errors that come back with every stride, beyond that of noise.
+
+    Every stride repeats what the model of the contact does wrong, and what the reconstruction of the base does: the
+    stretches of a walk are no independent pieces, however long it is. Independent are the phases of the gait, and the
+    joints: where they disagree on a parameter, more walking does not settle it. Added to a covariance over stretches
+    of time this is clustering several ways (Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136). Few pieces
+    know their own spread badly: each part is scaled to the normal distribution.
+
+    Parameters
+    ----------
+    problem : in which at least one log is a walk.
+    jacobian, residual : (r, p) and (r,), whitened.
+    """
+    from scipy.stats import norm, t
+
+    noise = np.diag(covariance(jacobian, residual, np.arange(len(residual)) // SHORT))
+    total = np.zeros(len(noise))
+    for pieces in (problem.column_labels, _phases(problem)):
+        if pieces is None or len(np.unique(pieces)) < FEWEST:
+            continue
+        cov, dof = spread(jacobian, residual, pieces)
+        with np.errstate(invalid="ignore"):
+            beyond = np.nan_to_num(np.diag(cov) - noise, posinf=0.0, neginf=0.0)
+        total += np.maximum(beyond, 0.0) * (t.ppf(0.975, dof) / norm.ppf(0.975)) ** 2
+    return np.asarray(np.sqrt(total))
+
+
+SHORT = 8
+"""Residuals in a row that make a piece where all are taken for independent."""
+
+
+def _phases(problem: ReplayProblem) -> IntArray | None:
+    """(r,) phase of the gait of the window that each residual belongs to; None where no gait repeats."""
+    labels, found, first = [], False, 0
+    for episode in problem.episodes:
+        log = episode.replay.log
+        length = stride(log) if isinstance(log, Walk) else None
+        # what repeats in no stride is in pieces of its own
+        phase = (log.time - log.time[0]).astype(np.int64)
+        if length is not None and isinstance(log, Walk) and log.windows is not None:
+            found = True
+            count = max(round(length / log.seconds), FEWEST)
+            for a, b in log.windows.rows:
+                middle = 0.5 * (log.time[a] + log.time[b - 1]) - log.time[0]
+                phase[a:b] = int(count * np.mod(middle / length, 1.0))
+        labels += [(first + np.broadcast_to(phase[:, None], t.mask.shape))[t.mask] for t in episode.targets]
+        first += int(phase.max()) + 1
+    return np.concatenate(labels) if found else None
+
+
+def stride(walk: Log) -> float | None:
+    """Time after which the commands of a walk repeat, s; None where they do not."""
+    step = float(np.median(np.diff(walk.time)))
+    moving = np.stack([c for n, c in walk.channels.items() if n.startswith("command.")], axis=1)
+    moving = np.nan_to_num(moving - np.nanmean(moving, axis=0))
+    moving = moving[:, np.std(moving, axis=0) > STILL]
+    lags = np.arange(round(STRIDES[0] / step), min(round(STRIDES[1] / step), len(moving) // 2))
+    if len(lags) < 3 or moving.shape[1] == 0:
+        return None
+    moving = moving / np.std(moving, axis=0)
+    alike = np.array([np.mean(moving[:-k] * moving[k:]) for k in lags])
+    inner = alike[1:-1]
+    peaks = np.flatnonzero((inner >= alike[:-2]) & (inner >= alike[2:]) & (inner > max(ALIKE, 0.95 * alike.max()))) + 1
+    return float(lags[peaks[0]] * step) if len(peaks) else None
+
+
+STRIDES = (0.3, 3.0)
+"""s, between which a stride lasts."""
+STILL = 0.01
+"""rad, standard deviation of a command below which a joint stands still."""
+ALIKE = 0.8
+"""Autocorrelation of commands that repeat."""
 
 
 def respond(replay: WindowReplay, values: FloatArray) -> Marginal:

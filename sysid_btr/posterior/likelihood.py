@@ -23,6 +23,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.estimators.base import Problem, UnitBox
 from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.identify.intervals import scatter
 
 RANK = 1e-9
 """Directions of `H` below this fraction of the largest are not seen by any residual."""
@@ -107,14 +108,12 @@ def make_likelihood(
         share = np.ones(len(root))
         frame = whitening
     else:
-        scores = _scores(scaled, residual, blocks) @ vectors[:, seen] / root
-        spread = _correction(blocks, len(x)) * scores.T @ scores
+        spread = scatter(scaled @ (vectors[:, seen] / root), residual, blocks, len(x)).matrix
         if shift is not None:
             moved = whitening @ (np.nan_to_num(shift) / box.span)
             spread = spread + np.outer(moved, moved)
-        white = max(float(residual @ residual) / max(len(residual) - len(x), 1), 1.0)
         inflation, turn = np.linalg.eigh(spread)
-        share = 1.0 / np.maximum(inflation, white)
+        share = 1.0 / inflation
         frame = turn.T @ whitening
     return Likelihood(
         box=box,
@@ -154,16 +153,3 @@ def settle(
             break
         x, residual, jacobian = other, other_residual, other_jacobian
     return x, residual, jacobian, replays
-
-
-def _scores(scaled: FloatArray, residual: FloatArray, blocks: IntArray) -> FloatArray:
-    """Gradient of half the loss, stretch by stretch, (stretches, p)."""
-    scores = np.zeros((int(blocks.max()) + 1, scaled.shape[1]))
-    np.add.at(scores, blocks, scaled * residual[:, None])
-    return scores
-
-
-def _correction(blocks: IntArray, p: int) -> float:
-    """Few stretches underestimate their own spread."""
-    stretches = max(len(np.unique(blocks)), 2)
-    return stretches / max(stretches - min(p, stretches // 2), 1)

@@ -1,0 +1,126 @@
+"""Least squares whose derivatives come from a cheap integrator and whose residuals come from the right one.
+
+Deferred correction (Stetter 1978, doi:10.1007/BF01432879): the cheap problem, shifted by the difference between the
+two at a point, is solved; there the difference is taken again, until the solution stays. What it converges to is the
+right integrator's minimum up to the difference of the derivatives, which is second order where the fit is good.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.estimators.base import Budget, FitResult, Progress, Termination
+from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.replay.engine import Numerics
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+
+ROUNDS = 4
+"""Times the difference is taken at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A problem under a cheap integrator, with the right residuals at one point.
+
+    Attributes
+    ----------
+    cheap : the problem under the cheap integrator.
+    offset : (r,) what its residuals lack at the point.
+    start : (p,) the point.
+    """
+
+    cheap: ReplayProblem
+    offset: FloatArray
+    start: FloatArray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.cheap.names
+
+    @property
+    def lower(self) -> FloatArray:
+        return self.cheap.lower
+
+    @property
+    def upper(self) -> FloatArray:
+        return self.cheap.upper
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """See `ReplayProblem.groups`."""
+        return self.cheap.groups
+
+    def support(self, parameter: int) -> BoolArray | None:
+        """See `ReplayProblem.support`."""
+        return self.cheap.support(parameter)
+
+    def residuals(self, candidates: FloatArray) -> FloatArray:
+        return self.cheap.residuals(candidates) + self.offset
+
+    def loss(self, candidates: FloatArray) -> FloatArray:
+        return np.asarray(np.sum(self.residuals(candidates) ** 2, axis=1))
+
+
+def corrected(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> Corrected:
+    """The problem under a cheap integrator, right at `values` (p,)."""
+    rough = problem.with_numerics(cheap)
+    pair = [p.residuals(values[None])[0] for p in (problem, rough)]
+    return Corrected(rough, np.nan_to_num(pair[0] - pair[1]), values)
+
+
+def deferred_fit(
+    problem: ReplayProblem,
+    cheap: Numerics,
+    estimator: LeastSquares,
+    *,
+    rng: Generator,
+    budget: Budget,
+    journal: Journal,
+    progress: Progress,
+) -> FitResult:
+    """Minimise a problem's squares with the derivatives of a cheaper integrator.
+
+    Parameters
+    ----------
+    problem : under the right integrator.
+    cheap : integrator and step of the derivatives.
+    estimator : what minimises.
+    rng, budget, journal, progress : see `sysid_btr.estimators`.
+
+    Returns
+    -------
+    FitResult
+        If the estimator confirms, with the right residuals at `x` and the cheap integrator's Jacobian. Converged once
+        another round lowers the right loss by less than the estimator's `least_gain`.
+    """
+    bare = replace(estimator, confirm=False)
+    near = corrected(problem, cheap, problem.start)
+    loss, evaluations = float(near.loss(near.start[None])[0]), 3
+    for _ in range(ROUNDS):
+        result = bare.fit(near, rng=rng, budget=budget, journal=journal, progress=progress)
+        evaluations += result.evaluations
+        if result.termination in (Termination.INTERRUPTED, Termination.BUDGET_SPENT, Termination.NO_FINITE_CANDIDATE):
+            return replace(result, evaluations=evaluations)
+        journal = journal.section()
+        there = corrected(problem, cheap, result.x)
+        now = float(there.loss(result.x[None])[0])
+        evaluations += 3
+        gain = (loss - now) / (now / len(there.offset))
+        if gain >= 0:
+            near, loss = there, now
+        if not gain >= estimator.least_gain:
+            break
+    result = replace(result, x=near.start, loss=loss, evaluations=evaluations)
+    if not estimator.confirm:
+        return result
+    residual, jacobian = linearise(near, near.start, step=estimator.central_step)
+    evaluations += 2 * len(near.start) + 1
+    return replace(result, evaluations=evaluations, jacobian=jacobian, residual=residual)
