@@ -67,6 +67,8 @@ HOPELESS = 0.5
 """After three trials, hypotheses that promise less than this fraction of the best are not tried."""
 ENOUGH = 0.006
 """Fraction of a column's excess that may be left: effects have shapes, not only amounts."""
+REST = 0.1
+"""Fraction of a column's excess that, left behind by effects that explain the rest, is told."""
 TRACE = 0.002
 """Fraction of a column's first excess that is not worth an effect."""
 STEP_GAIN = 0.03
@@ -218,7 +220,7 @@ def close(
     named = _named(study, state, before, final_estimates[count:], declared, candidates) if state.effects else ()
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
-    if verdict == "unexplained":
+    if verdict == "unexplained" or (kept and _something_left(before, state.fitted)):
         left = signature(study, state.fitted.modifiers, state.fitted.values)
     after = score(study, state.fitted.modifiers, state.fitted.values)
     unit = "m" if all(s.slide for s in study.scales.values()) else "rad"
@@ -343,6 +345,13 @@ def _good_enough(before: Fitted, now: Fitted) -> bool:
         return False
     limit = np.maximum(_column_limit(now), 1 + ENOUGH * (before.columns - 1))
     return bool(np.all(now.columns <= limit))
+
+
+def _something_left(before: Fitted, now: Fitted) -> bool:
+    """Whether some column keeps more of its excess, on all data, than the shape of an effect explains."""
+    if len(before.columns) != len(now.columns):
+        return False
+    return bool(np.any((now.columns > _column_limit(now)) & (now.columns - 1 > REST * (before.columns - 1))))
 
 
 def _thin(

@@ -82,7 +82,7 @@ class Closing:
     effects : what was missing.
     candidates : what was weighed, best first.
     steps : every step of the way.
-    signature : of the residual that is left, when unexplained.
+    signature : of the residual that is left, when unexplained or where effects that are named leave much of it.
     modifiers, values : the final model.
     replays, seconds : cost.
     """

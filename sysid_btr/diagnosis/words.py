@@ -54,6 +54,8 @@ def message_of(
     if verdict == "unexplained":
         hint = "" if not left else f" What is left is {left.get('summary', 'not characterised')}."
         return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
+    if left:
+        errors += f" Something is left that no effect accounts for: {left.get('summary', 'not characterised')}."
     listing = "; ".join(e.sentence for e in effects)
     if verdict == "ambiguous":
         other = ", ".join(dict.fromkeys(c for e in effects for c in e.confused_with))
