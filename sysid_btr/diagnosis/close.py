@@ -615,39 +615,55 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
 def _told_apart_from_nothing(
     study: Study, state: _State, declared: tuple[Modifier, ...], found: Sequence[Estimate]
 ) -> _State | None:
-    """The model without effects whose amounts may all be nothing, the least sure first; None where there are none.
+    """The model without effects, and places of effects, whose amounts may be nothing; None where there are none.
 
     Only what held-out data do not miss is dropped: of two effects that a log tells together but not apart, one stays.
     """
     offset = sum(len(m.parameters) for m in declared)
-    doubtful: list[tuple[float, Effect]] = []
+    doubtful: list[tuple[float, Effect, list[int]]] = []
     column = offset
     for effect in state.effects:
         size, kinds = len(effect.parameters), len(effect.kinds)
-        mains = found[column + effect.main : column + size : kinds]
-        nothing = effect.neutral[effect.main :: kinds]
-        if all(e.ci95[0] <= n <= e.ci95[1] for e, n in zip(mains, nothing, strict=True)):
-            sure = max(abs(e.value - n) / max(e.std, 1e-300) for e, n in zip(mains, nothing, strict=True))
-            doubtful.append((sure, effect))
+        pairs = zip(
+            found[column + effect.main : column + size : kinds], effect.neutral[effect.main :: kinds], strict=True
+        )
+        sure = [
+            0.0 if e.identifiable == "no" else abs(e.value - n) / max(e.std, 1e-300)
+            if e.ci95[0] <= n <= e.ci95[1]
+            else np.inf
+            for e, n in pairs
+        ]
+        kept = [i for i, s in enumerate(sure) if np.isinf(s)]
+        if len(kept) < len(sure):
+            doubtful.append((min(sure), effect, kept))
         column += size
     result: _State | None = None
     now = state
-    for _, effect in sorted(doubtful, key=lambda item: item[0]):
-        if len(now.effects) == 1:
+    for _, effect, kept in sorted(doubtful, key=lambda item: item[0]):
+        if not kept and len(now.effects) == 1:
             break
         at = now.effects.index(effect)
         first = offset + sum(len(e.parameters) for e in now.effects[:at])
-        values = np.delete(now.fitted.values, slice(first, first + len(effect.parameters)))
-        effects = (*now.effects[:at], *now.effects[at + 1 :])
+        own = now.fitted.values[first : first + len(effect.parameters)].reshape(-1, len(effect.kinds))
+        left: tuple[Effect, ...] = ()
+        if kept:
+            places = [effect.places[i] for i in kept]
+            left = (type(effect).at(places, study.scales).around(own[kept].ravel()),)
+        effects = (*now.effects[:at], *left, *now.effects[at + 1 :])
+        values = np.concatenate(
+            [now.fitted.values[:first], own[kept].ravel(), now.fitted.values[first + own.size :]]
+        )
         fitted = refit(study, (*declared, *effects), values, polish=True)
         if fitted.misfit <= state.fitted.misfit + NEAR:
-            result = now = _State(fitted, effects, (*now.rivals[:at], *now.rivals[at + 1 :]))
+            rivals = (*now.rivals[:at], *((now.rivals[at],) if left else ()), *now.rivals[at + 1 :])
+            result = now = _State(fitted, effects, rivals)
     return result
 
 
 def _named_only_in(before: _State, after: _State) -> tuple[str, ...]:
-    gone = (e for e in before.effects if e not in after.effects)
-    return tuple(f"{e.name} at {', '.join(e.places)}" for e in gone)
+    staying = {(e.name, e.variant, p) for e in after.effects for p in e.places}
+    gone = [(e, [p for p in e.places if (e.name, e.variant, p) not in staying]) for e in before.effects]
+    return tuple(f"{e.name} at {', '.join(places)}" for e, places in gone if places)
 
 
 def _verdict(before: Fitted, state: _State) -> Verdict:
