@@ -180,7 +180,7 @@ def close(
         staying = tuple(
             e
             for e in state.effects
-            if e.name not in hypothesis.effect.includes or not set(e.places) <= set(hypothesis.places)
+            if (e.label or e.name) not in hypothesis.effect.includes or not set(e.places) <= set(hypothesis.places)
         )
         if len(staying) < len(state.effects):
             fitted = _without(study, state, fitted, staying, hypothesis, declared)
