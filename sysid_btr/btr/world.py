@@ -15,7 +15,7 @@ from sysid_btr.errors import ModelError
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.modifier import Index, Modifier, Outputs, Rig
 from sysid_btr.models.robot import Robot
-from sysid_btr.replay.engine import CHUNK, Numerics, Replay, _setconst_inputs, make_index
+from sysid_btr.replay.engine import CHUNK, Numerics, Replay, make_index, set_out, write_model
 from sysid_btr.replay.quiet import quiet
 
 if TYPE_CHECKING:
@@ -82,26 +82,14 @@ class World(Replay):
         rig = self._rig(batch, pairs)
         held = np.repeat(commands[:, :-1], grid.steps // (commands.shape[1] - 1), axis=1)
         qpos, qvel = commands[:, 0].copy(), np.zeros((m, len(index.joints)))
-        applied: FloatArray | None = None
-        border_time = self.grid.timestep * np.arange(grid.steps + 1, dtype=np.float64)
-        for modifier, own in pairs:
-            modifier.initial_state(rig, own, qpos, qvel)
-            held = modifier.shape_command(rig, own, held)
-            torque = modifier.applied_torque(rig, own, border_time)
-            if torque is not None:
-                applied = torque if applied is None else applied + torque
-        batch.bind("qpos")[:, index.qpos] = qpos
-        batch.bind("qvel")[:, index.dof] = qvel
+        held, applied = set_out(rig, pairs, qpos, qvel, held, grid.steps)
         assert index.base is not None
         batch.bind("qpos")[:, index.base[0] + 2] -= lowest(self.model, batch)
         return self._go(rig, pairs, held, applied, grid)
 
     def _rig(self, batch: Batch, pairs: list[tuple[Modifier, FloatArray]]) -> Rig:
         rig = Rig(self.model, batch, self.index, self.numerics.timestep)
-        for modifier, own in pairs:
-            modifier.write_fields(rig, own)
-        if rig.touched & set(_setconst_inputs()):
-            batch.set_const()
+        write_model(rig, pairs)
         return rig
 
     def sensors(self, outputs: Outputs, command: FloatArray, values: FloatArray) -> dict[str, FloatArray]:

@@ -161,24 +161,11 @@ class Replay:
         pairs = self._values(candidates)
         batch = Batch(self.model, m, self.threads)
         rig = Rig(self.model, batch, self.index, self.numerics.timestep)
-        for modifier, values in pairs:
-            modifier.write_fields(rig, values)
-        if rig.touched & set(_setconst_inputs()):
-            batch.set_const()
-        index = self.index
+        write_model(rig, pairs)
         qpos = np.tile(self.start[0], (m, 1))
         qvel = np.tile(self.start[1], (m, 1))
         command: FloatArray = np.broadcast_to(self.grid.command, (m, *self.grid.command.shape))
-        applied: FloatArray | None = None
-        border_time = self.grid.timestep * np.arange(self.grid.steps + 1, dtype=np.float64)
-        for modifier, values in pairs:
-            modifier.initial_state(rig, values, qpos, qvel)
-            command = modifier.shape_command(rig, values, command)
-            torque = modifier.applied_torque(rig, values, border_time)
-            if torque is not None:
-                applied = torque if applied is None else applied + torque
-        batch.bind("qpos")[:, index.qpos] = qpos
-        batch.bind("qvel")[:, index.dof] = qvel
+        command, applied = set_out(rig, pairs, qpos, qvel, command, self.grid.steps)
         return self._go(rig, pairs, command, applied, self.grid)
 
     def _go(
@@ -507,6 +494,39 @@ class _Drive:
         finite = np.isfinite(force).any(axis=-1)
         self.forcelimited[:, self.actuators] = finite
         self.forcerange[:, self.actuators] = np.where(finite[..., None], force, 0.0)
+
+
+def write_model(rig: Rig, pairs: Sequence[tuple[Modifier, FloatArray]]) -> None:
+    """Write the model fields of every candidate, and what MuJoCo derives from them."""
+    for modifier, values in pairs:
+        modifier.write_fields(rig, values)
+    if rig.touched & set(_setconst_inputs()):
+        rig.batch.set_const()
+
+
+def set_out(
+    rig: Rig,
+    pairs: Sequence[tuple[Modifier, FloatArray]],
+    qpos: FloatArray,
+    qvel: FloatArray,
+    command: FloatArray,
+    steps: int,
+) -> tuple[FloatArray, FloatArray | None]:
+    """Put the batch where its replay begins: commands as they reach the servos, and torques known in advance.
+
+    `qpos` and `qvel` are (m, joints), `command` is (m, steps, joints); modifiers may change all of them.
+    """
+    applied: FloatArray | None = None
+    border_time = rig.timestep * np.arange(steps + 1, dtype=np.float64)
+    for modifier, values in pairs:
+        modifier.initial_state(rig, values, qpos, qvel)
+        command = modifier.shape_command(rig, values, command)
+        torque = modifier.applied_torque(rig, values, border_time)
+        if torque is not None:
+            applied = torque if applied is None else applied + torque
+    rig.batch.bind("qpos")[:, rig.index.qpos] = qpos
+    rig.batch.bind("qvel")[:, rig.index.dof] = qvel
+    return command, applied
 
 
 def servo_torque(

@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.models.modifier import Outputs, Rig
-from sysid_btr.replay.engine import CHUNK, CHUNK_DOFS, Replay, _setconst_inputs
+from sysid_btr.replay.engine import CHUNK, CHUNK_DOFS, Replay, set_out, write_model
 from sysid_btr.replay.grid import Grid
 from sysid_btr.replay.quiet import quiet
 
@@ -81,30 +81,17 @@ def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ..
             array[share] = getattr(replay.model, name)
     values_of = lead._values(candidates)
     pairs = [(modifier, np.tile(values, (logs, 1, 1))) for modifier, values in values_of]
-    for modifier, values in pairs:
-        modifier.write_fields(rig, values)
-    if rig.touched & set(_setconst_inputs()):
-        batch.set_const()
+    write_model(rig, pairs)
     grids = [replay.grid for replay in replays]
     steps = max(grid.steps for grid in grids)
-    index, h = lead.index, lead.numerics.timestep
     qpos = np.repeat(np.stack([r.start[0] for r in replays]), m, axis=0)
     qvel = np.repeat(np.stack([r.start[1] for r in replays]), m, axis=0)
     last = np.minimum(np.arange(steps), np.array([[g.steps - 1] for g in grids]))
     command = np.repeat(np.stack([g.command[k] for g, k in zip(grids, last, strict=True)]), m, axis=0)
-    applied: FloatArray | None = None
-    border_time = h * np.arange(steps + 1, dtype=np.float64)
-    for modifier, values in pairs:
-        modifier.initial_state(rig, values, qpos, qvel)
-        command = modifier.shape_command(rig, values, command)
-        torque = modifier.applied_torque(rig, values, border_time)
-        if torque is not None:
-            applied = torque if applied is None else applied + torque
-    batch.bind("qpos")[:, index.qpos] = qpos
-    batch.bind("qvel")[:, index.dof] = qvel
+    command, applied = set_out(rig, pairs, qpos, qvel, command, steps)
     # borders that any of the logs wants to see
     state = np.unique(np.concatenate([grid.state for grid in grids]))
-    whole = Grid(h, np.empty((steps, 0)), grids[0].sample_time, state, state, state, np.zeros(0))
+    whole = Grid(rig.timestep, np.empty((steps, 0)), grids[0].sample_time, state, state, state, np.zeros(0))
     states = lead.integrate(
         rig, pairs, command, applied, whole, [(r.log, g) for r, g in zip(replays, grids, strict=True)]
     )

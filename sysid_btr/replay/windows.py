@@ -15,7 +15,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.models.modifier import Modifier, Outputs, Rig
-from sysid_btr.replay.engine import Replay, _setconst_inputs
+from sysid_btr.replay.engine import Replay, write_model
 from sysid_btr.replay.grid import Grid
 
 SIMULATIONS = 96
@@ -256,12 +256,9 @@ class WindowReplay(Replay):
         size = len(window)
         batch = Batch(self.model, size, self.threads)
         rig = Rig(self.model, batch, self.index, h)
-        for modifier, values in pairs:
-            modifier.write_fields(rig, values)
+        write_model(rig, pairs)
         if "opt.gravity" in rig.touched:
             starts = on_slope(starts, np.array(self.model.opt.gravity), np.array(rig.array("opt.gravity")))
-        if rig.touched & set(_setconst_inputs()):
-            batch.set_const()
         qpos, qvel = starts.joint_position.copy(), starts.joint_velocity.copy()
         first = np.array([self._frames[w].first for w in window])
         lead = round(LEAD / h)
