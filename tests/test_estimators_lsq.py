@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sysid_btr._typing import FloatArray
 from sysid_btr.errors import SysidError, UsageError
 from sysid_btr.estimators import LeastSquares, Termination, get_estimator, linearise
 from sysid_btr.testing import (
@@ -349,3 +350,20 @@ def test_starts_outside_are_refused() -> None:
         run(LeastSquares(starts=((9.0, 9.0),)), rosenbrock())
     with pytest.raises(UsageError, match="2 numbers"):
         run(LeastSquares(starts=((1.0,),)), rosenbrock())
+
+
+def test_a_rough_objective_is_left_where_steps_keep_little_of_what_they_promise() -> None:
+    """A sawtooth in one parameter: its slopes mislead; following them gains next to nothing."""
+    spent = 0
+    for seed in range(3):
+        smooth, _ = linear_gaussian(np.random.default_rng(seed), p=4, r=4000)
+
+        def rough(x: FloatArray, smooth: ToyProblem = smooth) -> FloatArray:
+            tooth = x.copy()
+            tooth[:, 0] -= 0.7 * 3e-3 * np.floor(x[:, 0] / 3e-3)
+            return smooth.residuals(tooth)
+
+        result = run(LeastSquares(), replace(smooth, function=rough), evaluations=None)
+        spent += result.evaluations
+        assert result.loss < 1.1 * 4000
+    assert spent < 500

@@ -57,6 +57,9 @@ SIMPLER = 0.06
 """A simpler hypothesis wins if its misfit is within this of the best one's: 6 % of chi2 in one column."""
 NEAR = 0.15
 """A rival whose misfit is within this of the winner's is confused with it, unless a paired test decides."""
+OUTDONE = 1.0
+"""Another law of an effect is not tried if the first one's misfit is so much beyond the best: e times chi2 in one
+column."""
 SETTLED = 0.8
 """Once a hypothesis explains all there is, others are tried only if they promise this fraction of its gain."""
 MOST_THINNED, SMALL = 10, 0.5
@@ -111,6 +114,8 @@ def close(
     progress: Progress = silent,
     start: FloatArray | None = None,
     worth: float = TRACE,
+    alike: bool = False,
+    rounds: int = MAX_ROUNDS,
 ) -> Closing:
     """Name the effects that a model lacks.
 
@@ -125,6 +130,9 @@ def close(
     worth : fraction of some column's first excess over the floor that an effect must remove. The shapes of effects
         that are found are a little wrong, and much else would mend that; a smaller fraction builds a longer ladder
         for prediction, whose last rungs mean less.
+    alike : ask only for effects of the whole robot, and for those that are the same at all their places: few short
+        logs tell no more, and it takes a small part of the simulations.
+    rounds : how many effects are added at most.
 
     Returns
     -------
@@ -144,16 +152,16 @@ def close(
     replays = first.replays
     candidates: list[Candidate] = []
     note = "scan"
-    for round_number in range(1, MAX_ROUNDS + 1):
+    for round_number in range(1, rounds + 1):
         if _at_floor(state.fitted) or _good_enough(before, state.fitted):
             break
         progress(done=round_number, total=None, best=state.fitted.holdout, note=f"round {round_number}: {note}")
-        traces, residual = _scan(study, state, library)
+        traces, residual = _scan(study, state, library, alike)
         replays += len(traces)
         hypotheses = form_hypotheses(traces, len(residual), REFITS)
         trials: list[tuple[Hypothesis, Fitted]] = []
         for hypothesis in hypotheses:
-            if any(_settled(hypothesis, h, f) for h, f in trials):
+            if any(_settled(hypothesis, h, f) for h, f in trials) or _outdone(hypothesis, trials):
                 continue
             if len(trials) >= 3 and hypothesis.gain < HOPELESS * hypotheses[0].gain:
                 break
@@ -200,11 +208,12 @@ def close(
         state = _merge(study, state, declared)
         study = inflate(study, state.fitted, memory=True)
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="final fit")
-        polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True)
+        polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True, progress=progress)
         replays += polished.evaluations
         state = replace(state, fitted=polished)
     final_estimates: tuple[Estimate, ...] = first.estimates
     if state.effects:
+        progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="intervals")
         final_estimates, study, state = _estimates(study, state)
         real = _told_apart_from_nothing(study, state, declared, final_estimates)
         if real is not None:
@@ -216,7 +225,17 @@ def close(
     if later is not None:
         # what is missing shows only after the fitted part: fit more of the log, hold out what is left
         again = replace(later, numerics=first.study.numerics, inflation={})
-        return close(again, parameters, effects=effects, rng=rng, progress=progress, start=start, worth=worth)
+        return close(
+            again,
+            parameters,
+            effects=effects,
+            rng=rng,
+            progress=progress,
+            start=start,
+            worth=worth,
+            alike=alike,
+            rounds=rounds,
+        )
     named = _named(study, state, before, final_estimates[count:], declared, candidates) if state.effects else ()
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
@@ -286,7 +305,7 @@ def _switched(log: Log) -> bool:
 
 
 def _scan(
-    study: Study, state: _State, library: Sequence[type[Effect]]
+    study: Study, state: _State, library: Sequence[type[Effect]], alike: bool = False
 ) -> tuple[list[Trace], FloatArray]:
     values = state.fitted.values
     problem = shorten(study, SCAN_SECONDS).train_problem(state.fitted.modifiers, values)
@@ -298,7 +317,10 @@ def _scan(
         "robot": ("robot",),
     }
     asked: list[Question] = questions(library, places, study.scales)
-    asked += proposals(study, problem, values, residual, library)
+    if alike:
+        asked = [q for q in asked if len(q.places) > 1 or q.effect.scope == "robot"]
+    else:
+        asked += proposals(study, problem, values, residual, library)
     # an effect already at a place is not asked for again; it is refitted with everything else
     present = {(type(e), p) for e in state.effects for p in e.places}
     split = {p for e in state.effects if e.structural for p in e.places}
@@ -311,7 +333,14 @@ def _scan(
         glance = shorten(study, GLANCE_SECONDS).train_problem(state.fitted.modifiers, values)
         seen = scan(glance, values, *linearise(glance, values, step=study.stencil), asked, study.scales)
         asked = [t.question for t in seen[:GLANCED]]
-    return scan(problem, values, residual, jacobian, asked, study.scales), residual
+    traces = scan(problem, values, residual, jacobian, asked, study.scales)
+    if alike:
+        # one hypothesis an effect, begun at its best working point: a refit's ladder holds other amounts
+        best: dict[type[Effect], Trace] = {}
+        for trace in traces:
+            best.setdefault(trace.question.effect, trace)
+        traces = list(best.values())
+    return traces, residual
 
 
 def _try(
@@ -389,6 +418,18 @@ def _settled(hypothesis: Hypothesis, other: Hypothesis, fitted: Fitted) -> bool:
     """Whether another one explains all there is and this one, which is no simpler, promises much less."""
     enough = SETTLED if hypothesis.size >= other.size else HOPELESS
     return _at_floor(fitted) and hypothesis.gain < enough * other.gain
+
+
+def _outdone(hypothesis: Hypothesis, trials: Sequence[tuple[Hypothesis, Fitted]]) -> bool:
+    """Whether another law of the same effect at the same places did far worse than the best hypothesis."""
+    best = min((f.misfit for _, f in trials), default=np.inf)
+    return any(
+        f.misfit > best + OUTDONE
+        for h, f in trials
+        if h.effect is not hypothesis.effect
+        and h.effect.name == hypothesis.effect.name
+        and set(h.places) == set(hypothesis.places)
+    )
 
 
 def _gain(before: Fitted, after: Fitted) -> float:

@@ -44,6 +44,9 @@ _SMALLEST_CHANGE = (
 _WIDEST_STEP = 1e-2  # of the bounds' range
 _STD_FRACTION = 1e-2  # a step shorter than 0.1 std lowers the loss by less than this times loss / r
 _ROUGH_FRACTION = 1e-1  # tolerated instead where no step lowers the loss: 0.3 std
+_SLOW_FRACTION = 0.5  # a step that gains less than this, in the same unit ...
+_MANY = 1000  # residuals, from which on their mean square says what noise is
+_KEPT = 0.1  # ... and less than this share of what it promised tells of a rough objective, not of a way to go
 _LOSS_MISMATCH = 1e-6
 _FIRST_DAMPING = 0.1
 
@@ -348,7 +351,7 @@ class LeastSquares:
         steps: FloatArray,
         scheme: _Scheme,
     ) -> _Point:
-        ladder, slow = self._ladder(_FIRST_DAMPING, trust=False), 0
+        ladder, slow, halted = self._ladder(_FIRST_DAMPING, trust=False), 0, Termination.STALLED
         for iteration in range(1, self.max_iterations + 1):
             note = f"iteration {iteration}"
             model, steps = _linearise(problem, evaluator, u, steps, scheme, note)
@@ -361,25 +364,36 @@ class LeastSquares:
             promised = model.predicted(full)
             tolerance = min(self.tolerance, self.least_gain / model.residuals)
             short = bool(np.max(np.abs(full)) < self.step_tolerance)
-            if short or promised <= tolerance * loss:
-                blind = model.failed.any()
-                return _Point(u, loss, steps, Termination.STALLED if blind else Termination.CONVERGED, model)
+            if short or promised <= tolerance * loss or slow == 2:
+                there = halted if slow == 2 else Termination.CONVERGED
+                return _Point(u, loss, steps, Termination.STALLED if model.failed.any() else there, model)
             found = _climb(evaluator, model, u, loss, scheme.rank_tolerance, ladder, note)
             rough = promised <= max(_ROUGH_FRACTION, 4 * self.least_gain) / model.residuals * loss
             rough |= promised <= tolerance * loss
             halted = Termination.CONVERGED if rough and not model.failed.any() else Termination.STALLED
-            if found is None and model.neighbour[1] < (1.0 - tolerance) * loss:
+            stumbled = found is None and model.neighbour[1] < (1.0 - tolerance) * loss
+            if stumbled:
                 found = (*model.neighbour, _FIRST_DAMPING)  # what the differences stumbled on
             if found is None:
                 return _Point(u, loss, steps, halted, model)
             new_u, new_loss, factor = found
             ladder = self._ladder(factor or _FIRST_DAMPING, trust=factor == 0.0)
-            slow = slow + 1 if loss - new_loss < tolerance * loss else 0
-            if slow == 2:
+            gained = loss - new_loss
+            slow = slow + 1 if gained < max(tolerance * loss, self._little(model, promised, stumbled)) else 0
+            if slow == 2 and gained < tolerance * loss:
                 # Two steps without a gain worth having: stay where the model was made.
                 return _Point(u, loss, steps, halted, model)
             u, loss = new_u, new_loss
+            if slow == 2 and not scheme.central:
+                return _Point(u, loss, steps, halted)
         return _Point(u, loss, steps, Termination.ITERATION_LIMIT)
+
+    def _little(self, model: _Linear, promised: float, stumbled: bool) -> float:
+        """Gain below which a step that promised more tells of a rough objective."""
+        if model.residuals < _MANY:
+            return 0.0
+        worth = max(_SLOW_FRACTION, self.least_gain) / model.residuals * model.loss
+        return _KEPT * promised if stumbled else min(worth, _KEPT * promised)
 
     def _ladder(self, centre: float, *, trust: bool) -> tuple[FloatArray, ...]:
         """Damping factors about the one that worked last, in the batches to try them in."""

@@ -316,10 +316,11 @@ def hold_unidentifiable(
     blind = fewest_to_hold(jacobian, found)
     if not blind.any() or blind.all():
         return values, found, 0
-    held = values.copy()
-    held[blind] = np.array([e.nominal for e in found])[blind]
+    change = np.array([e.nominal for e in found]) - values
+    change[~blind] = -np.linalg.lstsq(jacobian[:, ~blind], jacobian[:, blind] @ change[blind], rcond=1e-6)[0]
+    held = np.clip(values + change, problem.lower, problem.upper)
     conditional = Conditional(problem, ~blind, held)
-    result = LeastSquares().fit(
+    result = LeastSquares(confirm=False, least_gain=ENOUGH).fit(
         conditional, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
     )
     complete = conditional.complete(result.x[None])[0]
@@ -338,6 +339,8 @@ def hold_unidentifiable(
     return values, tuple(moved), result.evaluations
 
 
+ENOUGH = 0.03
+"""Decrease of the loss, in mean squared residuals, that moves no estimate by more than a sixth of its error."""
 WORSE = 1.01
 """Ratio of losses beyond which nominal values are worse than estimates, whatever the intervals of these say."""
 

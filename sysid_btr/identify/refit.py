@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget, silent
+from sysid_btr.estimators.base import Budget, Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.deferred import deferred_fit
@@ -79,6 +79,7 @@ def refit(
     *,
     polish: bool = False,
     iterations: int = 8,
+    progress: Progress = silent,
 ) -> Fitted:
     """Least squares from a first guess; `polish` runs to convergence with central differences."""
     problem = study.train_problem(modifiers, np.clip(start, *_bounds(modifiers)))
@@ -86,14 +87,15 @@ def refit(
         confirm=polish,
         max_iterations=30 if polish else iterations,
         tolerance=1e-6 if polish else 2e-4,
+        least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
     if study.free:
         estimator = walking(estimator)
     rng, budget, journal = np.random.default_rng(0), Budget(), Journal()
     if study.free and study.numerics != study.rough:
-        result = deferred_fit(problem, study.rough, estimator, rng=rng, budget=budget, journal=journal, progress=silent)
+        result = deferred_fit(problem, study.rough, estimator, rng=rng, budget=budget, journal=journal, progress=progress)
     else:
-        result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=silent)
+        result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
     return judge(study, modifiers, result.x, evaluations=result.evaluations)
 
 
@@ -112,7 +114,8 @@ MOST_WALKED = 8.0
 
 
 LEAST_GAIN = 0.5
-"""Decrease of the sum of squared residuals, in their mean square, for which a walk is not simulated again."""
+"""Decrease of the sum of squared residuals, in their mean square, for which a hypothesis, or a walk, is not simulated
+again."""
 
 
 def walking(estimator: LeastSquares) -> LeastSquares:

@@ -132,7 +132,8 @@ class Step:
     @property
     def drive(self) -> FloatArray:
         """The servo's torque under what other laws have done to it so far."""
-        return np.clip(self.gain * self.torque + self.motor_torque, self.limit_low, self.limit_high)
+        total = self.gain * self.torque + self.motor_torque
+        return np.minimum(np.maximum(total, self.limit_low), self.limit_high)
 
 
 @dataclass

@@ -8,7 +8,7 @@ whatever the number of candidates and the length of the log.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,6 @@ from sysid_btr.replay.start import initial_state
 
 if TYPE_CHECKING:
     import mujoco
-    from mujoco.batch import Batch
 
     from sysid_btr.io.log import Log
 
@@ -85,6 +84,16 @@ class Replay:
     def parameters(self) -> tuple[Parameter, ...]:
         """Free numbers of a candidate, in the order of its columns."""
         return tuple(p for modifier in self.modifiers for p in modifier.parameters)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process needs to simulate the same: the compiled model in place of what makes it.
+
+        It runs there on one thread: who sends it has many of them run side by side.
+        """
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        made = {name: getattr(self, name) for name in ("model", "index", "start", "grid")}
+        robot = replace(self.robot, make_spec=made_elsewhere, configure=None)
+        return {**own, **made, "robot": robot, "threads": 1}
 
     @property
     def all_modifiers(self) -> tuple[Modifier, ...]:
@@ -234,7 +243,7 @@ class Replay:
 
         batch, index, keep = rig.batch, self.index, grid.state
         states = States.empty(rig.size, len(keep), index)
-        states.store(batch, index, 0, grid)
+        states.put(index, np.array([0]), batch.bind("qpos")[:, None], batch.bind("qvel")[:, None])
         spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
         nu, nv = self.model.nu, self.model.nv
         if applied is not None:
@@ -261,7 +270,7 @@ class Replay:
         d, driven = drive.driven, drive.actuators
         qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         qfrc = batch.bind("qfrc_applied")
-        low, high = np.sort(np.stack([drive.base_low, drive.base_high]) / drive.gear, axis=0)
+        low, high = np.sort(np.stack([drive.low[:, d], drive.high[:, d]]) / drive.gear, axis=0)
         asked = drive.base_gain[None, :, :, 0] * np.moveaxis(command[:, :, d], 1, 0) + drive.base_bias[..., 0]
         stiffness = drive.base_bias[..., 1] * drive.gear
         damping = drive.base_bias[..., 2] * drive.gear
@@ -310,6 +319,8 @@ class Replay:
         acts = frozenset(name for modifier, _ in laws for name in modifier.law_acts)
         held_steps = self.numerics.held_steps
         held: FloatArray | None = None
+        # laws that leave the servo alone leave its torque a function of command and state
+        measured = states.effort if held_steps or acts & {"servo", "limit"} else None
         qpos_view, qvel_view, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         qfrc, bias = batch.bind("qfrc_applied"), batch.bind("qfrc_bias")
         previous = qvel_view[:, index.dof].copy()
@@ -317,7 +328,7 @@ class Replay:
         for k in range(grid.steps):
             q, v = qpos_view[:, index.qpos], qvel_view[:, index.dof]
             if slot < len(grid.state) and grid.state[slot] == k:
-                states.store(batch, index, slot, grid)
+                states.store(index, slot, q, v, qpos_view, qvel_view)
                 slot += 1
             v_mid = 1.5 * v - 0.5 * previous
             q_mid = q + 0.5 * h * v_mid
@@ -330,13 +341,18 @@ class Replay:
             if held_steps and k % held_steps == 0:
                 held = drive.torque(step, command[:, k], q, v)
             drive.write(step, acts, held)
-            if states.effort is not None and slot > 0 and grid.state[slot - 1] == k:
-                states.effort[:, slot - 1] = drive.torque(step, command[:, k], q, v)
+            if measured is not None and slot > 0 and grid.state[slot - 1] == k:
+                measured[:, slot - 1] = drive.torque(step, command[:, k], q, v)
             ctrl[:, drive.actuators] = command[:, k][:, drive.driven]
             joint_torque = step.joint_torque if applied is None else step.joint_torque + applied[:, k]
             qfrc[:, index.dof] = joint_torque
             batch.step()
-        states.store(batch, index, len(grid.state) - 1, grid)
+        q, v = qpos_view[:, index.qpos], qvel_view[:, index.dof]
+        states.store(index, len(grid.state) - 1, q, v, qpos_view, qvel_view)
+        if states.effort is not None and measured is None:
+            known = slice(len(grid.state) - 1)
+            asked = command[:, grid.state[known]]
+            states.effort[:, known] = drive.plain(asked, states.motor[:, known], states.motor_velocity[:, known])
         states.repeat_last_effort()
         return states
 
@@ -395,8 +411,14 @@ class States:
             self.position[:, slots[:, None], linked] += qpos[:, :, index.link_qpos[linked]]
             self.velocity[:, slots[:, None], linked] += qvel[:, :, index.link_dof[linked]]
 
-    def store(self, batch: Batch, index: Index, slot: int, grid: Grid) -> None:
-        self.put(index, np.array([slot]), batch.bind("qpos")[:, None], batch.bind("qvel")[:, None])
+    def store(
+        self, index: Index, slot: int, q: FloatArray, v: FloatArray, qpos: FloatArray, qvel: FloatArray
+    ) -> None:
+        """Keep one state: `q` and `v` are the joints' part of `qpos` and `qvel`."""
+        if self.position is self.motor and self.base is None:
+            self.motor[:, slot], self.motor_velocity[:, slot] = q, v
+        else:
+            self.put(index, np.array([slot]), qpos[:, None], qvel[:, None])
 
 
 class _Drive:
@@ -419,48 +441,54 @@ class _Drive:
         self.base_limited = self.forcelimited[:, self.actuators].copy()
         limited = self.base_limited.astype(bool)
         base = np.sort(self.gear[..., None] * self.forcerange[:, self.actuators], axis=-1)
-        self.base_low = np.where(limited, base[..., 0], -np.inf)
-        self.base_high = np.where(limited, base[..., 1], np.inf)
         shape = (rig.size, len(index.joints))
         self._shape = shape
+        self.low, self.high = np.full(shape, -np.inf), np.full(shape, np.inf)
+        self.low[:, self.driven] = np.where(limited, base[..., 0], -np.inf)
+        self.high[:, self.driven] = np.where(limited, base[..., 1], np.inf)
+        self._all = len(self.driven) == len(index.joints)
+        gain, bias = self.base_gain, self.base_bias
+        self._law = (gain[..., 0], bias[..., 0], bias[..., 1] * self.gear, bias[..., 2] * self.gear)
 
     def begin(self, time: float, h: float, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> Step:
         shape = self._shape
-        low, high = np.full(shape, -np.inf), np.full(shape, np.inf)
-        low[:, self.driven], high[:, self.driven] = self.base_low, self.base_high
         return Step(
             time=time,
             timestep=h,
             command=command,
             qpos=qpos,
             qvel=qvel,
-            torque=np.clip(self._servo(command, qpos, qvel), low, high),
+            torque=np.minimum(np.maximum(self._servo(command, qpos, qvel), self.low), self.high),
             gain=np.ones(shape),
             motor_torque=np.zeros(shape),
             joint_torque=np.zeros(shape),
             friction=np.zeros(shape),
-            limit_low=low,
-            limit_high=high,
+            limit_low=self.low.copy(),
+            limit_high=self.high.copy(),
             inputs={},
             load=np.zeros(shape),
         )
 
     def _servo(self, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
-        torque = np.zeros(self._shape)
-        d, g, b = self.driven, self.base_gain, self.base_bias
-        force = (
-            g[..., 0] * command[:, d]
-            + b[..., 0]
-            + b[..., 1] * self.gear * qpos[:, d]
-            + b[..., 2] * self.gear * qvel[:, d]
-        )
-        torque[:, d] = self.gear * force
+        kp, constant, stiffness, damping = self._law
+        if self._all:
+            return np.asarray(self.gear * (kp * command + constant + stiffness * qpos + damping * qvel))
+        torque, d = np.zeros(self._shape), self.driven
+        torque[:, d] = self.gear * (kp * command[:, d] + constant + stiffness * qpos[:, d] + damping * qvel[:, d])
         return torque
+
+    def plain(self, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
+        """The servo's own torque at many states, (m, states, joints)."""
+        d, gear = self.driven, self.gear[:, None]
+        kp, constant, stiffness, damping = (part[:, None] for part in self._law)
+        torque = np.zeros(qpos.shape)
+        torque[..., d] = gear * (kp * command[..., d] + constant + stiffness * qpos[..., d] + damping * qvel[..., d])
+        return np.clip(torque, self.low[:, None], self.high[:, None])
 
     def torque(self, step: Step, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
         """Servo torque at the start of the step, under the step's laws."""
         total = step.gain * self._servo(command, qpos, qvel) + step.motor_torque
-        return np.clip(total, step.limit_low, step.limit_high)
+        return np.minimum(np.maximum(total, step.limit_low), step.limit_high)
 
     def restore(self) -> None:
         """Give the servos back what `write` or a held torque took."""
@@ -560,6 +588,11 @@ def servo_torque(
         clipped = np.clip(force, limits[:, :1], np.maximum(limits[:, 1:2], limits[:, :1]))
         torque[:, :, j] = gear * np.where(limited, clipped, force)
     return torque
+
+
+def made_elsewhere() -> mujoco.MjSpec:
+    """In the place of a model's source, where only the compiled model was sent."""
+    raise ModelError("this model was compiled in another process, and cannot be compiled anew here")
 
 
 def compile_model(
