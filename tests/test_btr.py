@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 
 from sysid_btr.btr.choice import Pool, disagreement, fittest, pool_of
+from sysid_btr.btr.closing import join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
 from sysid_btr.btr.loop import BackToReality, Iteration, Settings, back_to_reality, disengaged
 from sysid_btr.btr.problems import ControllerProblem, ModelProblem, Stage
 from sysid_btr.btr.result import btr_result, estimate_model
-from sysid_btr.btr.robot import HiddenRobot, Noise, Robot, Trial
+from sysid_btr.btr.robot import SILENT, HiddenRobot, Noise, Robot, Trial
+from sysid_btr.btr.study import early_logs, trial_study
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.cli import run
+from sysid_btr.effects.base import Effect
 from sysid_btr.effects.command_delay import CommandDelay
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators import CmaEs, GeneticAlgorithm, Record
@@ -415,7 +418,7 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
     delay = CommandDelay(places=tuple(SPACE.joints), shared=True)
     asked: list[int] = []
 
-    def look(robot: object, own: Sequence[Modifier], values: np.ndarray, tried: Sequence[Tried], n: int) -> object:
+    def look(own: Stage, values: np.ndarray, tried: Sequence[Tried], n: int, progress: object) -> object:
         asked.append(len(tried))
         if len(asked) > 1:
             return {"message": "nothing more", "params": None}
@@ -443,6 +446,53 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
     if disk:
         assert same(tiny(hidden(), tmp_path, settings), outcome)
         assert len(asked) == 2
+
+
+def test_a_trial_is_replayed_as_it_was_made() -> None:
+    log = hidden(SILENT).run(Controller(some_controllers(1)[0])).log
+    assert log is not None
+    problem = trial_study(stage(), [log], [log], 1).train_problem(modifiers(), np.ones(2))
+    ((_, outputs),) = problem.episodes[0].replay.chunks(TRUTH[None])
+    assert np.array_equal(problem.episodes[0].targets[0].predicted(outputs)[0], problem.episodes[0].targets[0].measured)
+    # the part that a shorter log has, and trials together
+    half = trial_study(stage(), [log.window(0, 26), log], [log], 1).train_problem(modifiers(), np.ones(2))
+    assert half.residuals(TRUTH[None]).shape == (1, (26 + 51) * 18)
+    assert np.abs(half.residuals(TRUTH[None])).max() == 0
+
+
+def test_trials_that_lasted_are_looked_at_whether_they_fell_later_or_not() -> None:
+    trial = hidden().run(Controller(some_controllers(1)[0]))
+    assert trial.log is not None
+    fallen, short = replace(trial, outcome="fallen"), replace(trial, log=trial.log.window(0, 20), outcome="fallen")
+    tried = [Tried(1, Controller(SPACE.start), 0.0, t) for t in (trial, fallen, short, Trial(None, 0.0, "crashed"))]
+    assert early_logs(stage(), tried, 4) == [trial.log, fallen.log]
+    assert early_logs(stage(), tried, 1) == [fallen.log]
+
+
+def test_a_joint_that_no_model_follows_does_not_outweigh_the_others() -> None:
+    controllers = some_controllers(2)
+    trials = [hidden().run(Controller(c)) for c in controllers]
+    log = trials[0].log
+    assert log is not None
+    name = f"position.{SPACE.joints[0]}"
+    broken = replace(trials[0], log=replace(log, channels={**log.channels, name: 1 + np.sin(7 * log.time)}))
+    problem = ModelProblem(stage(), controllers, [broken, trials[1]], "likelihood", np.ones(2))
+    losses = problem.loss(np.array([TRUTH, TRUTH + np.array([0.05, 0.0]), TRUTH - np.array([0.0, 0.05])]))
+    assert np.argmin(losses) == 0
+    assert np.isnan(replace(problem, stage=stage()).loss(np.array([[np.nan, 1.0]]))).all()
+
+
+def test_effects_are_found_in_trials_of_a_robot_that_stands_on_its_own() -> None:
+    delay = CommandDelay(places=tuple(SPACE.joints), shared=True)
+    world = make_world(MODEL, TASK, (*modifiers(), delay), threads=1)
+    late = HiddenRobot(world, np.array([*TRUTH, 0.03]), TASK, SPACE, Noise())
+    tried = [Tried(1, Controller(c), 0.0, late.run(Controller(c))) for c in 0.5 * some_controllers(2)]
+    joined = join_effects(stage(), np.ones(2), tried, None, 1)
+    named = [m for m in joined.modifiers if isinstance(m, Effect)]
+    assert [m.name for m in named] in (["command_delay"], ["sensor_delay"])
+    assert abs(joined.values[-1] - 0.03) < 0.002
+    assert np.all(np.abs(joined.values[:2] - TRUTH) < np.abs(1 - TRUTH))
+    assert joined.simulations > 10
 
 
 def params_entry(found: Sequence[Modifier], values: np.ndarray) -> dict[str, object]:

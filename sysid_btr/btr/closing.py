@@ -11,14 +11,23 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.trials import Tried
+from sysid_btr.diagnosis.closing import StepRecord
 from sysid_btr.errors import SysidError
+from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot
 from sysid_btr.session import Folder
 
-LOGS = 3
-"""Trials whose logs are looked at: the fittest that did not fall, which move most."""
+LOGS, FEWEST = 4, 2
+"""Trials that are looked at, half of them held out, at most and at least."""
+EXPLAINED = 3.0
+"""Position error, in noise floors, of trials' beginnings up to which nothing is looked for."""
+SAME = ("sensor_delay",)
+"""Effects not asked for: commands that are played from rest do not tell a late encoder from a late command."""
+WORTH, ROUNDS = 0.05, 2
+"""Fraction of some joint's error that an effect must explain to join the model, and effects that join at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,34 +38,37 @@ class Joined:
     ----------
     message : in words.
     modifiers, values : the model with the effects; empty where none was named.
+    simulations : of trials, that it took.
     """
 
     message: str
     modifiers: tuple[Modifier, ...] = ()
     values: FloatArray | tuple[float, ...] = ()
+    simulations: int = 0
 
 
 def join_effects(
-    robot: Robot,
-    modifiers: Sequence[Modifier],
+    stage: Stage,
     values: FloatArray,
     tried: Sequence[Tried],
     kept: Path | None,
     threads: int = 0,
+    progress: Progress = silent,
 ) -> Joined:
     """Look for what the model lacks, unless this was done before the run was stopped.
 
     Parameters
     ----------
-    robot, modifiers, values : the model so far.
+    stage, values : the model so far.
     tried : all trials.
     kept : file in which the finding is kept.
     threads : worker threads.
+    progress : see `sysid_btr.estimators`.
     """
     params = None if kept is None else kept.with_name(f"{kept.stem}_params.json")
     if kept is not None and params is not None and kept.exists():
-        return _read(json.loads(kept.read_text(encoding="utf-8")), params, robot)
-    found = _look(robot, modifiers, values, tried, threads)
+        return _read(json.loads(kept.read_text(encoding="utf-8")), params, stage.world.robot)
+    found = _look(stage, values, tried, threads, progress)
     if kept is None or params is None:
         return _direct(found)
     kept.parent.mkdir(parents=True, exist_ok=True)
@@ -65,51 +77,106 @@ def join_effects(
         from sysid_btr.result import to_json
 
         folder.write(params.name, to_json(found["params"]))
-    summary = {"message": found["message"], "named": found["params"] is not None}
+    summary = {
+        "message": found["message"],
+        "named": found["params"] is not None,
+        "simulations": found.get("simulations", 0),
+    }
     folder.write(kept.name, json.dumps(summary, indent=1) + "\n")
-    return _read(summary, params, robot)
+    return _read(summary, params, stage.world.robot)
 
 
-def _look(
-    robot: Robot, modifiers: Sequence[Modifier], values: FloatArray, tried: Sequence[Tried], threads: int
-) -> dict[str, Any]:
+def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int, progress: Progress) -> dict[str, Any]:
+    """Look for effects that are the same all over the robot, with bodies as they are and drives free.
+
+    Few trials of one gait tell masses or lengths from nothing else: free, they take the place of what is missing.
+    Step 3 corrects them afterwards. An effect joins if trials that were not fitted say so, even if more is missing.
+    """
+    from sysid_btr.btr.study import early_logs, trial_study
     from sysid_btr.diagnosis.close import close
-    from sysid_btr.effects.base import Effect
-    from sysid_btr.identify.study import make_study
-    from sysid_btr.writeback.write import identified, params_of
+    from sysid_btr.effects.library import select_effects
+    from sysid_btr.identify.refit import judge
+    from sysid_btr.writeback.write import Identified, params_of
 
-    standing = [t for t in tried if t.trial.log is not None and t.trial.outcome == "done"]
-    logs = [t.trial.log for t in sorted(standing, key=lambda t: -t.trial.fitness)[:LOGS] if t.trial.log is not None]
-    if not logs:
-        return {"message": "no trial with a log that did not fall: nothing can be looked for", "params": None}
-    declared = [m for m in modifiers if not isinstance(m, Effect)]
-    count = sum(len(m.parameters) for m in declared)
+    logs = early_logs(stage, tried, LOGS)
+    logs = logs[len(logs) % 2 :]  # as many fitted as held out
+    if len(logs) < FEWEST:
+        message = "fewer than two trials with a log of their first seconds: nothing can be looked for"
+        return {"message": message, "params": None}
+    declared = _split(stage.world.modifiers, values)
+    free = [m for m, _ in declared if getattr(m, "scope", "") != "body"] or [m for m, _ in declared]
+    held = tuple((m, v) for m, v in declared if m not in free)
+    start = np.array([x for m, v in declared if m in free for x in v])
+    effects = tuple(dict.fromkeys(e.name for e in select_effects(("all",)) if e.name not in SAME))
     try:
-        study = make_study(robot, logs, threads=threads)
-        closing = close(study, declared, start=np.asarray(values[:count]))
+        study = trial_study(stage, logs[::2], logs[1::2], threads, held)
+        now = judge(study, tuple(free), start)
+        error = float(np.sqrt(max(now.train, now.holdout)))
+        if error <= EXPLAINED:
+            message = f"nothing is looked for: the trials begin as the model foresees within {error:.2g} noise floors"
+            return {"message": message, "params": None, "simulations": now.evaluations * len(logs)}
+        closing = close(
+            study,
+            free,
+            effects=effects,
+            start=start,
+            alike=True,
+            worth=WORTH,
+            rounds=ROUNDS,
+            progress=progress,
+        )
     except SysidError as error:
         return {"message": f"missing effects could not be looked for: {error}", "params": None}
-    if not closing.effects:
-        return {"message": f"{closing.verdict.replace('_', ' ')}: {closing.message}", "params": None}
-    model = identified(closing)
+    found = _split(closing.modifiers, closing.values)
+    joining = found[len(free) :]
+    score = f"held-out position error {_error(closing.steps[0])} -> {_error(closing.steps[-1])} noise floors"
+    spent = closing.replays * len(logs)
+    if not joining:
+        return {"message": f"no effect is worth adding; {score}", "params": None, "simulations": spent}
+    fitted = {id(m): v for m, v in found}
+    model = [*((m, fitted.get(id(m), v)) for m, v in declared), *joining]
+    modifiers = tuple(m for m, _ in model)
+    numbers = np.array([x for _, v in model for x in v])
+    told = "; ".join(
+        f"{m.name} at {len(m.places)} places: "
+        + ", ".join(f"{x:.3g} {p.unit}" for p, x in zip(m.parameters, v, strict=True))
+        for m, v in joining
+    )
     return {
-        "message": f"{closing.verdict}: {closing.message}",
-        "params": params_of(model),
-        "modifiers": model.modifiers,
-        "values": model.written,
+        "message": f"joined the model: {told}; {score}",
+        "simulations": spent,
+        "params": params_of(Identified(study, modifiers, numbers, (), ())),
+        "modifiers": modifiers,
+        "values": numbers,
     }
+
+
+def _split(modifiers: Sequence[Modifier], values: FloatArray) -> list[tuple[Modifier, tuple[float, ...]]]:
+    """Modifiers with their own values."""
+    result, column = [], 0
+    for m in modifiers:
+        own = values[column : column + len(m.parameters)]
+        column += len(own)
+        result.append((m, tuple(float(v) for v in own)))
+    return result
+
+
+def _error(step: StepRecord) -> str:
+    return f"{np.sqrt(step.holdout):.3g}"
 
 
 def _direct(found: dict[str, Any]) -> Joined:
     if found["params"] is None:
-        return Joined(found["message"])
-    return Joined(found["message"], tuple(found["modifiers"]), np.asarray(found["values"]))
+        return Joined(found["message"], simulations=found.get("simulations", 0))
+    values = np.asarray(found["values"])
+    return Joined(found["message"], tuple(found["modifiers"]), values, found.get("simulations", 0))
 
 
 def _read(summary: dict[str, Any], params: Path, robot: Robot) -> Joined:
+    spent = int(summary.get("simulations", 0))
     if not summary["named"]:
-        return Joined(summary["message"])
+        return Joined(summary["message"], simulations=spent)
     from sysid_btr.writeback.params import read_params
 
     own = read_params(params, robot)
-    return Joined(summary["message"], own.modifiers, own.values)
+    return Joined(summary["message"], own.modifiers, own.values, spent)

@@ -44,7 +44,7 @@ UNTOLD = 0.2
 UNEXPLAINED = 3.0
 """Position error of the best model, in noise floors, above which something may be missing ..."""
 STUCK = 0.9
-"""... if Step 3 leaves more than this fraction of the loss it began with."""
+"""... if Step 3 leaves more than this fraction of the loss it began with, or it was not looked for yet."""
 
 STEPS = {"controllers": 1, "models": 3}
 """Searches of an iteration by the paper's numbers."""
@@ -330,7 +330,7 @@ class _Loop:
         problem = self._model_problem(self._remembered(), before)
         searched = self._search_model(number, problem)
         if searched is not None and self.settings.close and self._stuck(problem, searched[1]):
-            joined = self._close(number)
+            joined = self._close(number, before)
             if joined:
                 problem = self._model_problem(self._remembered(), self.values)
         report = self._report(number, found, last, tried, transfer, problem, searched, joined)
@@ -395,15 +395,23 @@ class _Loop:
         return found, journal
 
     def _stuck(self, problem: ModelProblem, journal: Journal) -> bool:
-        """Whether Step 3 found hardly anything better, and the sensors say that something is missing."""
+        """Whether the sensors say that something is missing, and Step 3 found hardly anything better.
+
+        The first time it need not have tried for long: missing effects spoil the parameters that it fits.
+        """
         losses = _all_of(journal)[1]
-        little = float(np.min(losses)) > STUCK * float(losses[0])
+        little = float(np.min(losses)) > STUCK * float(losses[0]) or not any(r.joined for r in self.rounds)
         return little and bool(problem.targets) and problem.noise(self.values) > UNEXPLAINED
 
-    def _close(self, number: int) -> str:
-        """Name missing effects and add them to the model; what was found, in words."""
+    def _close(self, number: int, values: FloatArray) -> str:
+        """Name missing effects and add them to the model; what was found, in words.
+
+        It begins where Step 3 began: what that found without the effects is spoilt by them.
+        """
         kept = None if self.folder is None else self.folder / "closings" / f"{number:02d}.json"
-        joined: Joined = join_effects(self.model, self.modifiers, self.values, self.book.made, kept, self.threads)
+        noted = _noted(self.progress, f"iteration {number}, closing")
+        joined: Joined = join_effects(self.stage, values, self.book.made, kept, self.threads, noted)
+        self.simulations += joined.simulations
         if joined.modifiers:
             self.modifiers = joined.modifiers
             self.stage = self._stage(self.modifiers)

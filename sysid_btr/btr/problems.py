@@ -144,7 +144,7 @@ class ModelProblem:
             usable = [i for i, t in enumerate(self.trials) if t.outcome != "crashed"]
             real = np.array([self.trials[i].fitness for i in usable])
             return phi1(real, self.stage.fitness(self.controllers[usable], candidates))
-        return self._sensors(get_distance(self.distance) or SumOfSquares(), candidates)
+        return self._sensors(get_distance(self.distance) or Likelihood(), candidates)
 
     def noise(self, candidate: FloatArray) -> float:
         """Root mean square of the position error over the noise floor: one for a model that misses nothing."""
@@ -170,6 +170,21 @@ class SumOfSquares:
     def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
         error = ((target.measured - predicted) / target.sigma)[:, target.mask]
         return np.asarray(np.sum(error**2, axis=1))
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Negative log-likelihood, up to a constant, of Gaussian errors whose size each joint and trial has for itself.
+
+    The prior of the size says the noise floor, with the weight of as many samples as there are. A walk that a whole
+    replay cannot follow for long, whatever the model, so counts little, as does a joint that the model does badly.
+    """
+
+    def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
+        error = np.where(target.mask, (target.measured - predicted) / target.sigma, 0.0)
+        count = target.mask.sum(axis=0)
+        size = np.einsum("mnk,mnk->mk", error, error) / np.maximum(count, 1)
+        return np.asarray(np.log1p(size) @ count.astype(np.float64))
 
 
 def on_clock(log: Log, time: FloatArray) -> Log:

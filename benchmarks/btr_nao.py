@@ -1,0 +1,256 @@
+"""`python -m benchmarks.btr_nao --seeds 0 1 --out out/btr_nao`: Back to Reality on a hidden Nao.
+
+The hidden robot has the masses of Aldebaran's V3.2 documentation, 0.9 of the nominal kp, commands 25 ms late and dry
+friction, another amount in every joint and in every seed; its step is 2 ms, the model's 5 ms. The model declares all
+masses, left and right alike, kp and kv, and neither delay nor friction. 20 real trials of 8 s, in 5 iterations.
+The loop must walk farther than what nominal-only search finds, and must name delay and friction on the way.
+
+Nominal-only search has as many simulated walks as the loop in all and begins each of its searches at the fittest
+controller on the robot, as the loop does. Of it are told: its last controller transferred blindly, and the best of as
+many real trials, chosen as the loop chooses its own.
+
+A seed that is finished is read, one that was stopped goes on; the table is of all seeds that are finished.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+
+from benchmarks.paper_nao import V32
+from sysid_btr.btr.choice import get_choice, pool_of
+from sysid_btr.btr.controllers import Controller, NaoGait
+from sysid_btr.btr.loop import BackToReality, Settings, back_to_reality, controller_search, first_controller_search
+from sysid_btr.btr.problems import ControllerProblem, Stage
+from sysid_btr.btr.result import btr_result
+from sysid_btr.btr.robot import HiddenRobot, Noise
+from sysid_btr.btr.task import Walk
+from sysid_btr.btr.trials import TrialBook
+from sysid_btr.btr.world import make_world
+from sysid_btr.effects.base import Effect
+from sysid_btr.effects.command_delay import CommandDelay
+from sysid_btr.effects.coulomb_friction import CoulombFriction
+from sysid_btr.estimators import Budget, CmaEs, Journal, silent
+from sysid_btr.models.grammar import parse_parameters
+from sysid_btr.models.robot import load_robot, servo_joints
+from sysid_btr.replay.engine import Numerics
+from sysid_btr.replay.log import set_parameters
+from sysid_btr.report.btr import draw_btr
+from sysid_btr.result import to_json
+
+TASK = Walk(8.0)
+FREE = (*(f"mass:{place}=shared" for place in V32), "kp:*=shared", "kv:*=shared")
+DELAY, GAIN, FRICTION = 0.025, 0.9, (0.1, 0.3)
+"""s, of all commands; kp over its nominal; Nm, of each joint."""
+HIDDEN = Numerics("implicitfast", 0.002)
+FRICTIONS = ("coulomb_friction", "stribeck_friction", "load_friction")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a seed is run."""
+
+    iterations: int = 5
+    trials: int = 4
+    memory: int = 4
+    distance: str = "likelihood"
+    choice: str = "fittest"
+
+    @property
+    def settings(self) -> Settings:
+        first = first_controller_search()
+        return Settings(
+            iterations=self.iterations,
+            trials=self.trials,
+            first=first,
+            controllers=replace(first, mutation=controller_search(len(NaoGait().names)).mutation),
+            models=CmaEs(population=12, max_generations=8, sigma=0.1),
+            distance=self.distance,
+            choice=self.choice,
+            memory=self.memory,
+            close=True,
+        )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; 0 when the table is written."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.btr_nao", description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="to run; without, only the table")
+    parser.add_argument("--out", type=Path, default=Path("out/btr_nao"), help="folder of the runs")
+    parser.add_argument("--threads", type=int, default=1)
+    for name, value in vars(Plan()).items():
+        parser.add_argument(f"--{name}", type=type(value), default=value)
+    parser.add_argument("--record", action="store_true", help="write the table beside the other results")
+    options = parser.parse_args(argv)
+    plan = Plan(**{name: getattr(options, name) for name in vars(Plan())})
+    for seed in options.seeds:
+        run_seed(seed, plan, options.out / f"seed_{seed:02d}", options.threads)
+    found = [json.loads(p.read_text()) for p in sorted(options.out.glob("seed_*/summary.json"))]
+    if found:
+        (options.out / "table.json").write_text(to_json(table(found)))
+        if options.record:
+            (Path(__file__).parent / "results" / "btr_nao.json").write_text(to_json(table(found)))
+    print(show(found))
+    return 0
+
+
+def hidden_robot(seed: int, threads: int = 1) -> HiddenRobot:
+    """The robot of a seed."""
+    model = load_robot("nao")
+    joints = servo_joints(model)
+    friction = np.random.default_rng([seed, 1000]).uniform(*FRICTION, len(joints))
+    modifiers, values = set_parameters(model, {**{f"mass:{n}": f for n, f in V32.items()}, "kp:*=shared": GAIN})
+    modifiers = (*modifiers, CommandDelay(places=joints, shared=True), CoulombFriction(places=joints))
+    world = replace(make_world(model, TASK, modifiers, threads=threads), numerics=HIDDEN)
+    return HiddenRobot(world, np.concatenate([values, [DELAY], friction]), TASK, NaoGait(), Noise(), seed)
+
+
+def run_seed(seed: int, plan: Plan, out: Path, threads: int) -> dict[str, Any]:
+    """One hidden Nao: the loop and what it is compared with."""
+    done = out / "summary.json"
+    if done.exists():
+        content: dict[str, Any] = json.loads(done.read_text())
+        return content
+    out.mkdir(parents=True, exist_ok=True)
+    began, cpu = perf_counter(), process_time()
+    model, space, robot = load_robot("nao"), NaoGait(), hidden_robot(seed, threads)
+    modifiers = parse_parameters(list(FREE), model)
+    outcome = back_to_reality(
+        model,
+        modifiers,
+        robot,
+        space,
+        task=TASK,
+        settings=plan.settings,
+        seed=seed,
+        folder=out,
+        threads=threads,
+        say=lambda text: print(f"seed {seed} ({process_time() - cpu:.0f} s CPU): {text}", flush=True),
+    )
+    result = btr_result(outcome)
+    (out / "result.json").write_text(to_json(result))
+    (out / "fig3.png").write_bytes(draw_btr(result))
+    loop_s = process_time() - cpu
+    summary = {
+        "seed": seed,
+        "plan": vars(plan),
+        **_of_loop(outcome, robot),
+        **nominal_only(Stage(make_world(model, TASK, modifiers, threads=threads), TASK, space), robot, outcome, out),
+        "loop_cpu_s": loop_s,
+        "cpu_s": process_time() - cpu,
+        "wall_s": perf_counter() - began,
+    }
+    done.write_text(to_json(summary))
+    return summary
+
+
+def _of_loop(outcome: BackToReality, robot: HiddenRobot) -> dict[str, Any]:
+    effects = [m for m in outcome.stage.world.modifiers if isinstance(m, Effect)]
+    model = dict(zip([p.name for p in outcome.parameters], outcome.model, strict=True))
+    amounts = {e.name: [float(v) for n, v in model.items() if n.startswith(f"{e.name}:")] for e in effects}
+    return {
+        "trials": len(outcome.tried),
+        "fell": sum(t.trial.outcome != "done" for t in outcome.tried),
+        "best": [i.best for i in outcome.iterations],
+        "transfer": [i.transfer for i in outcome.iterations],
+        "noise": [i.noise for i in outcome.iterations],
+        "closings": {str(i.number): i.joined for i in outcome.iterations if i.joined},
+        "effects": amounts,
+        "delay": amounts.get("command_delay"),
+        "friction": next((amounts[n] for n in FRICTIONS if n in amounts), None),
+        "model": model,
+        "true_friction": robot.truth[-22:],
+        "simulations": outcome.simulations,
+        "reason": outcome.reason,
+    }
+
+
+def nominal_only(stage: Stage, robot: HiddenRobot, outcome: BackToReality, out: Path) -> dict[str, Any]:
+    """Controllers searched in the nominal model alone, with as many simulated walks and as many real trials."""
+    settings = outcome.settings
+    nominal = np.array([p.nominal for p in stage.parameters])
+    generations = max(round(outcome.simulations / (settings.iterations * 20)), 11)
+    book = TrialBook(out / "nominal_trials")
+    blind = stage.space.start
+    best_of_all, spent = -np.inf, 0
+    for number in range(1, settings.iterations + 1):
+        search = replace(settings.first if number == 1 else settings.controllers, generations=generations)  # type: ignore[type-var]
+        start = stage.space.start if book.best is None else book.best.controller.values
+        journal = Journal(out / f"nominal_{number:02d}.jsonl")
+        found = search.fit(
+            ControllerProblem(stage, nominal, start),
+            rng=np.random.default_rng([outcome.seed, 3000, number]),
+            budget=Budget(),
+            journal=journal,
+            progress=silent,
+        )
+        spent += found.evaluations
+        if -found.loss > best_of_all:
+            best_of_all, blind = -found.loss, found.x
+        pool = pool_of(journal.records, book.known)
+        for row in get_choice("fittest")(pool, settings.trials, lambda some: np.zeros((1, len(some)))):
+            book.add(robot, number, pool.controllers[row], float(pool.expected[row]))
+    assert book.best is not None
+    best = outcome.best.trial.fitness
+    transferred = robot.run(Controller(blind))
+    return {
+        "nominal_blind": transferred.fitness,
+        "nominal_blind_outcome": transferred.outcome,
+        "nominal_expected": best_of_all,
+        "nominal_tried": book.best.trial.fitness,
+        "nominal_trials": len(book.made),
+        "nominal_simulations": spent,
+        "over_nominal_blind": best / transferred.fitness,
+        "over_nominal_tried": best / book.best.trial.fitness,
+    }
+
+
+def table(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the study says over seeds."""
+    return {
+        "command": "python -m benchmarks.btr_nao --seeds " + " ".join(str(f["seed"]) for f in found),
+        "hidden": {"masses": V32, "kp": GAIN, "delay_s": DELAY, "friction_Nm": FRICTION, "numerics": str(HIDDEN)},
+        "seeds": found,
+        "farther_than_blind": sum(f["best"][-1] > f["nominal_blind"] for f in found),
+        "farther_than_tried": sum(f["best"][-1] > f["nominal_tried"] for f in found),
+        "delay_named": sum(f["delay"] is not None for f in found),
+        "friction_named": sum(f["friction"] is not None for f in found),
+        "over_nominal_blind_median": np.median([f["over_nominal_blind"] for f in found]),
+        "over_nominal_tried_median": np.median([f["over_nominal_tried"] for f in found]),
+        "cpu_s": [f["cpu_s"] for f in found],
+    }
+
+
+def show(found: Sequence[dict[str, Any]]) -> str:
+    """The table as text."""
+    if not found:
+        return "no seed is finished; give --seeds"
+    lines = [
+        "seed  trials  best m/s  nominal blind  nominal tried  effects (true: delay 0.025 s, friction 0.1 to 0.3 Nm)"
+    ]
+    for f in found:
+        effects = ", ".join(f"{n} {' '.join(f'{v:.3g}' for v in vs[:3])}" for n, vs in f["effects"].items())
+        lines.append(
+            f"{f['seed']:4d}  {f['trials']:6d}  {f['best'][-1]:8.4f}  {f['nominal_blind']:13.4f}  "
+            f"{f['nominal_tried']:13.4f}  {effects or 'none named'}"
+        )
+    s = table(found)
+    lines.append(
+        f"farther than nominal-only search blindly {s['farther_than_blind']}/{len(found)} (median "
+        f"{s['over_nominal_blind_median']:.2f} times), with as many real trials {s['farther_than_tried']}/{len(found)} "
+        f"({s['over_nominal_tried_median']:.2f} times); delay named {s['delay_named']}, friction "
+        f"{s['friction_named']}/{len(found)}; {np.median(s['cpu_s']):.0f} s CPU a seed"
+    )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

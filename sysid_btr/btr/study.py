@@ -1,0 +1,152 @@
+"""Trials as a study: what `close` needs to look for what the model lacks.
+
+A trial begins from standing still in a known pose. So its early part is replayed from there as in Step 3, and needs
+no reconstruction of the base, as windows of a walk do; those cost many times the simulations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.btr.problems import Stage, on_clock
+from sysid_btr.btr.trials import Tried
+from sysid_btr.btr.world import World
+from sysid_btr.identify.study import Study, measure_scales
+from sysid_btr.io.log import Log
+from sysid_btr.models.modifier import Modifier, Outputs
+from sysid_btr.models.scales import Scales
+from sysid_btr.objectives.problem import Episode
+from sysid_btr.objectives.targets import make_targets
+from sysid_btr.replay.engine import Numerics
+
+CHANNELS = ("position",)
+SECONDS = 2.0
+"""s, from its beginning, of a trial that is looked at. Then the base has hardly moved; later an error of it drags all
+joints along, and what a whole replay shows is chaos more and more, whatever the model."""
+
+
+Held = tuple[tuple[Modifier, tuple[float, ...]], ...]
+"""Modifiers and their values."""
+
+
+@dataclass(frozen=True)
+class TrialReplay(World):
+    """The world as a replay of one trial: the commands are those of its log.
+
+    Attributes
+    ----------
+    held : what is not as nominal, beside what a candidate changes.
+    """
+
+    held: Held = ()
+
+    @property
+    def all_modifiers(self) -> tuple[Modifier, ...]:
+        return (*self.robot.always, *(m for m, _ in self.held), *self.modifiers)
+
+    def _values(self, candidates: FloatArray) -> list[tuple[Modifier, FloatArray]]:
+        fixed = [value for _, values in self.held for value in values]
+        return super()._values(np.column_stack([np.tile(fixed, (len(candidates), 1)), candidates]))
+
+    @cached_property
+    def played(self) -> FloatArray:
+        """Commands (1, n, j) for all joints of the model."""
+        joints = self.log.joints("command")
+        return self.spread(joints, self.log.array("command", joints)[None])
+
+    def _run(self, candidates: FloatArray) -> Outputs:
+        return self._walk(np.repeat(self.played, len(candidates), axis=0), candidates)
+
+
+@dataclass(frozen=True, eq=False)
+class TrialStudy(Study):
+    """A study whose logs are trials, replayed whole from where they began.
+
+    Attributes
+    ----------
+    held : as of `TrialReplay`.
+    """
+
+    held: Held = ()
+
+    @cached_property
+    def scales(self) -> Scales:
+        replays = [self._replay(log, (), effort=True) for log in self.train]
+        return measure_scales(self.robot, self.train, self.numerics, self.threads, replays)
+
+    @property
+    def free(self) -> bool:
+        return True
+
+    @property
+    def rough(self) -> Numerics:
+        """That of the trials: it is cheap already."""
+        return self.numerics
+
+    def settled(
+        self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True, anew: bool = True
+    ) -> Study:
+        """As it is: where a trial began is known."""
+        return self
+
+    def _replay(self, log: Log, modifiers: Sequence[Modifier], *, effort: bool = False) -> TrialReplay:
+        return TrialReplay(
+            self.robot, log, tuple(modifiers), self.numerics, effort=effort, threads=self.threads, held=self.held
+        )
+
+    def _episode(
+        self, log: Log, modifiers: Sequence[Modifier], channels: tuple[str, ...], begin: float, end: float
+    ) -> Episode:
+        run = self._replay(log, modifiers)
+        targets = make_targets(log, run.index.joints, channels, 0.0)
+        mount = log.meta.mount
+        targets = tuple(
+            replace(t, sigma=t.noise * [self.inflation.get((mount, t.channel, joint), 1.0) for joint in t.joints])
+            for t in targets
+        )
+        time = log.time - log.time[0]
+        return Episode(run, tuple(t.window(begin, end, time) for t in targets))
+
+
+def trial_study(
+    stage: Stage, logs: Sequence[Log], held_out: Sequence[Log], threads: int = 0, held: Held = ()
+) -> TrialStudy:
+    """Some trials to fit, and others to judge by.
+
+    Parameters
+    ----------
+    stage : the model so far.
+    logs, held_out : of trials; at least one each.
+    threads : worker threads.
+    held : modifiers that stay at given values.
+    """
+    time = early(stage)
+    return TrialStudy(
+        robot=stage.world.robot,
+        train=tuple(on_clock(log, time) for log in logs),
+        holdout=tuple(on_clock(log, time) for log in held_out),
+        split=(0.0,) * len(held_out),
+        channels=CHANNELS,
+        numerics=stage.world.numerics,
+        numerics_error=np.nan,
+        threads=threads,
+        held=held,
+    )
+
+
+def early(stage: Stage) -> FloatArray:
+    """Sample times (n,) of the part of a trial that is looked at."""
+    time = stage.task.time
+    return time[: int(np.searchsorted(time, SECONDS + 1e-9))]
+
+
+def early_logs(stage: Stage, tried: Sequence[Tried], most: int) -> list[Log]:
+    """Logs of the newest trials of which the early part is whole; a fall that comes later is no matter."""
+    end = float(early(stage)[-1])
+    logs = [t.trial.log for t in tried if t.trial.log is not None and t.trial.outcome != "crashed"]
+    return [log for log in logs if log.time[-1] - log.time[0] >= end - 1e-6][-most:]
