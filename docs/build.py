@@ -31,6 +31,7 @@ TITLES = {
     "robot_and_log": "Your robot and your log",
     "verdicts": "What each verdict means",
     "effects": "Effects",
+    "machines": "Many machines",
     "limits": "Limits",
     "commands": "Commands",
     "reference": "API",

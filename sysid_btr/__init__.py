@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sysid_btr.cluster import open_executor
     from sysid_btr.diagnosis.close import close
     from sysid_btr.identify.fit import fit
     from sysid_btr.identify.study import make_study
@@ -33,6 +34,7 @@ _HOME = {
     "import_log": "sysid_btr.importing",
     "load_robot": "sysid_btr.models.robot",
     "make_study": "sysid_btr.identify.study",
+    "open_executor": "sysid_btr.cluster",
     "posterior": "sysid_btr.posterior",
     "read_log": "sysid_btr.io.parquet",
     "read_result": "sysid_btr.result",
@@ -49,6 +51,7 @@ __all__ = [
     "import_log",
     "load_robot",
     "make_study",
+    "open_executor",
     "posterior",
     "read_log",
     "read_result",

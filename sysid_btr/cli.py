@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from sysid_btr.errors import InterruptedRun, LogError, SysidError, UsageError
+from sysid_btr.errors import InterruptedRun, LogError, LostCluster, SysidError, UsageError
 from sysid_btr.request import (
     Keeper,
     Request,
@@ -228,6 +228,15 @@ Priors = Annotated[
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")]
 Threads = Annotated[int, typer.Option("--threads", min=0, help="Worker threads; 0 for all cores.")]
+ExecutorPlace = Annotated[
+    str | None,
+    typer.Option(
+        "--executor",
+        metavar="tcp://HOST:PORT|local[:N]",
+        help="Simulate on the workers of a dask cluster, or on N one-thread worker processes of its own; the results "
+        "are the same. [default: threads of this process]",
+    ),
+]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -513,6 +522,7 @@ def fit(
     profile: Profiles = None,
     seed: Seed = 0,
     threads: Threads = 0,
+    executor: ExecutorPlace = None,
     out: Out = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -548,6 +558,7 @@ def fit(
             "bounds": bounds or [],
             "params": params_digest(params),
         },
+        executor,
     )
     keeper = Keeper.open(out, resume, overwrite, request)
     _check_render(render, keeper)
@@ -587,6 +598,7 @@ def posterior(
     ] = None,
     seed: Seed = 0,
     threads: Threads = 0,
+    executor: ExecutorPlace = None,
     out: Out = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -634,6 +646,7 @@ def posterior(
             "ensembles": ensembles,
             "walkers": walkers,
         },
+        executor,
     )
     keeper = Keeper.open(out, resume, overwrite, request)
     _check_render(render, keeper)
@@ -674,6 +687,7 @@ def close(
     channels: Channels = None,
     seed: Seed = 0,
     threads: Threads = 0,
+    executor: ExecutorPlace = None,
     out: Out = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -705,6 +719,7 @@ def close(
         threads,
         seed,
         {"effects": names, "bounds": bounds or [], "params": params_digest(params)},
+        executor,
     )
     keeper = Keeper.open(out, resume, overwrite, request)
     _check_render(render, keeper)
@@ -1101,15 +1116,18 @@ def _finish(request: Request, keeper: Keeper, job: Job, as_json: bool, render: b
 
 def _run(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool = False) -> int:
     """Do the work, write and print what it found; the exit code."""
+    from sysid_btr.cluster import open_executor
     from sysid_btr.result import exit_code, make_result
     from sysid_btr.writeback.write import describe_model
 
     began = time.perf_counter()
-    with ProgressLine(request.kind) as progress:
+    with ProgressLine(request.kind) as progress, open_executor(request.executor) as executor:
         try:
-            outcome = job(request.study(), progress)
+            outcome = job(request.study(executor), progress)
         except Interrupted:
             raise InterruptedRun(_interrupted(keeper, progress)) from None
+        except LostCluster as lost:
+            raise InterruptedRun(f"{lost}\n{_interrupted(keeper, progress)}") from None
     result = make_result(outcome, seed=request.seed, wall_s=time.perf_counter() - began)
     if keeper.folder is not None:
         page = write_all(keeper.folder, outcome, result)

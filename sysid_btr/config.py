@@ -62,6 +62,7 @@ class StudyFile(BaseModel):
     criterion: str | None = None
     seed: int | None = None
     threads: int | None = None
+    executor: str | None = None
     out: str | None = None
     json_: bool | None = Field(default=None, alias="json")
     resume: bool | None = None
@@ -121,6 +122,7 @@ class StudyFile(BaseModel):
                     "criterion",
                     "seed",
                     "threads",
+                    "executor",
                     "out",
                 )
             },

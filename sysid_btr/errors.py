@@ -37,3 +37,7 @@ class InterruptedRun(SysidError):
     """The user stopped the work; the journal and the best answer so far are kept."""
 
     exit_code = 130
+
+
+class LostCluster(InterruptedRun):
+    """The machines that simulate are gone; what was simulated before is in the journal, if one is kept."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sysid_btr.models.modifier import Modifier, Parameter
     from sysid_btr.models.robot import Robot
     from sysid_btr.replay.engine import Numerics
+    from sysid_btr.replay.executor import Executor
 
 DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
 """What `close` frees where nothing is said: a wrong mass or gain must not pass for an effect."""
@@ -47,8 +48,9 @@ class Request:
     threads: int
     seed: int
     settings: dict[str, Any]
+    executor: str | None = None
 
-    def study(self) -> Study:
+    def study(self, executor: Executor) -> Study:
         """Logs and model laid out; remarks on the logs go to stderr."""
         from sysid_btr.identify.study import make_study
         from sysid_btr.objectives.targets import FITTED
@@ -62,6 +64,7 @@ class Request:
             holdout=_holdout(self.holdout),
             channels=chosen,
             threads=self.threads,
+            executor=executor,
         )
 
     def fingerprint(self) -> str:

@@ -33,6 +33,7 @@ from sysid_btr.effects.slew_limit import SlewLimit
 from sysid_btr.effects.speed_torque_limit import SpeedTorqueLimit
 from sysid_btr.effects.torque_limit import TorqueLimit
 from sysid_btr.effects.viscous_damping import ViscousDamping
+from sysid_btr.estimators import Journal
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
@@ -324,3 +325,30 @@ def test_a_digital_servo_is_no_missing_effect(planted: bool) -> None:
     kp = next(p for p in found.parameters if p.name.startswith("kp"))
     assert abs(kp.value - TRUE_KP) < 0.01 * TRUE_KP
     assert found.study.numerics.servo_period == 0.004
+
+
+class Halt(BaseException):
+    """The end of a run, as a power cut ends it."""
+
+
+@pytest.mark.parametrize("when", ["round 1: with", "final fit"])
+def test_a_closing_that_was_cut_off_goes_on_to_the_same_answer(when: str, tmp_path: Path) -> None:
+    plant = next(p for p in PLANTS if p.effect.name == "coulomb_friction")
+    study = make_study(toys.leg(), [recorded(plant)])
+    whole = diagnose(plant)
+
+    def cut(*, note: str = "", **_: Any) -> None:
+        if note.startswith(when):
+            raise Halt
+
+    with pytest.raises(Halt):
+        close(study, TOY_FIT, journal=Journal(tmp_path / "journal.jsonl"), progress=cut)
+    journal = Journal(tmp_path / "journal.jsonl")
+    kept = {line.kind for line in journal.records}
+    done = len(journal)
+    again = close(study, TOY_FIT, journal=journal)
+    assert kept == {"loss", "residuals", "scan"}
+    assert journal.position >= done, "nothing that was done is done again"
+    np.testing.assert_array_equal(again.values, whole.values)
+    assert again.verdict == whole.verdict
+    assert again.replays == whole.replays

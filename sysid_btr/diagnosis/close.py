@@ -16,7 +16,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord, Verdict
-from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
+from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
 from sysid_btr.diagnosis.scan import Question, Trace, questions, scan
 from sysid_btr.diagnosis.signature import proposals, signature
 from sysid_btr.diagnosis.split import later_split
@@ -24,7 +24,7 @@ from sysid_btr.diagnosis.words import message_of, sentence_of
 from sysid_btr.effects.base import Effect
 from sysid_btr.effects.library import select_effects
 from sysid_btr.estimators.base import Progress, silent
-from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift, walking_error
 from sysid_btr.identify.intervals import Estimate, estimates
@@ -142,7 +142,7 @@ def close(
     began = perf_counter()
     library = usable_effects(select_effects(effects), study)
     first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
-    study = first.study
+    study = replace(first.study, journal=None if journal is None else journal.section())
     declared = first.modifiers
     before = judge(study, declared, first.values, first.replays)
     study = inflate(study, before)
@@ -156,9 +156,8 @@ def close(
         if _at_floor(state.fitted) or _good_enough(before, state.fitted):
             break
         progress(done=round_number, total=None, best=state.fitted.holdout, note=f"round {round_number}: {note}")
-        traces, residual = _scan(study, state, library, alike)
-        replays += len(traces)
-        hypotheses = form_hypotheses(traces, len(residual), REFITS)
+        hypotheses, answers = _promising(study, state, library, alike)
+        replays += answers
         trials: list[tuple[Hypothesis, Fitted]] = []
         for hypothesis in hypotheses:
             if any(_settled(hypothesis, h, f) for h, f in trials) or _outdone(hypothesis, trials):
@@ -230,6 +229,7 @@ def close(
             parameters,
             effects=effects,
             rng=rng,
+            journal=study.journal and study.journal.section(),
             progress=progress,
             start=start,
             worth=worth,
@@ -302,6 +302,25 @@ def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[
 def _switched(log: Log) -> bool:
     """Whether a drive is off for a part of the log."""
     return any(bool(np.any(v == 0)) for name, v in log.channels.items() if name.startswith("enabled."))
+
+
+def _promising(
+    study: Study, state: _State, library: Sequence[type[Effect]], alike: bool
+) -> tuple[list[Hypothesis], int]:
+    """The leading hypotheses of a scan, and how many questions were answered; an interrupted run noted them."""
+    values = state.fitted.values[None]
+    places = (*joint_names(study.robot), *body_names(study.robot), "robot")
+    known = None if study.journal is None else study.journal.replay("scan", values, whole=True)
+    if known is not None:
+        return from_arrays(known.arrays, library, places), int(known.arrays["answers"])
+    began = perf_counter()
+    traces, residual = _scan(study, state, library, alike)
+    hypotheses = form_hypotheses(traces, len(residual), REFITS)
+    if study.journal is not None:
+        arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(traces)), "loss": np.zeros(1)}
+        seconds = study.journal.seconds + perf_counter() - began
+        study.journal.append(Record("scan", values, arrays, seconds))
+    return hypotheses, len(traces)
 
 
 def _scan(

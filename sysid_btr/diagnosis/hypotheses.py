@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,6 +98,42 @@ def form_hypotheses(traces: Sequence[Trace], residuals: int, most: int) -> list[
                 result.append(Hypothesis(effect, places, True, np.median(values, axis=0), gain))
     result.sort(key=lambda h: -h.gain)
     return _varied(_without_idle(result), most)
+
+
+def to_arrays(
+    hypotheses: Sequence[Hypothesis], effects: Sequence[type[Effect]], places: Sequence[str]
+) -> dict[str, FloatArray]:
+    """Hypotheses as numbers, for a journal: effects and places by their position in the given lists."""
+    wide = max((len(h.places) for h in hypotheses), default=0)
+    long = max((h.size for h in hypotheses), default=0)
+    where, start = np.full((len(hypotheses), wide), np.nan), np.full((len(hypotheses), long), np.nan)
+    for row, h in enumerate(hypotheses):
+        where[row, : len(h.places)] = [places.index(p) for p in h.places]
+        start[row, : h.size] = h.start
+    return {
+        "effect": np.array([effects.index(h.effect) for h in hypotheses], dtype=np.float64),
+        "places": where,
+        "shared": np.array([h.shared for h in hypotheses], dtype=np.float64),
+        "start": start,
+        "gain": np.array([h.gain for h in hypotheses]),
+    }
+
+
+def from_arrays(
+    arrays: Mapping[str, FloatArray], effects: Sequence[type[Effect]], places: Sequence[str]
+) -> list[Hypothesis]:
+    """The inverse of `to_arrays`."""
+    rows = zip(*(arrays[name] for name in ("effect", "places", "shared", "start", "gain")), strict=True)
+    return [
+        Hypothesis(
+            effects[int(effect)],
+            tuple(places[int(p)] for p in where[~np.isnan(where)]),
+            bool(shared),
+            start[~np.isnan(start)],
+            float(gain),
+        )
+        for effect, where, shared, start, gain in rows
+    ]
 
 
 def _best_probe_per_place(traces: Sequence[Trace]) -> list[Trace]:

@@ -198,10 +198,12 @@ def _ask(
     responses: dict[tuple[int, int], FloatArray | None] = {}
     rows_of = {limb: np.flatnonzero(limb_of_row == limb) for limb in lanes}
     everywhere = np.arange(len(rest))
-    base = wide.residuals(candidates[:1])[0]
-    for first in range(1, len(candidates), BLOCK):
-        block = wide.residuals(candidates[first : first + BLOCK]) - base
-        for change, job in zip(block, jobs[first - 1 : first - 1 + BLOCK], strict=False):
+    asks = [[], *jobs]  # the first candidate asks nothing: the others are compared with it
+    for first in range(0, len(candidates), BLOCK):
+        block = wide.residuals(candidates[first : first + BLOCK])
+        if first == 0:
+            base = block[0].copy()
+        for change, job in zip(block - base, asks[first : first + BLOCK], strict=True):
             for i, d in job:
                 rows = rows_of.get(_limb(asked[i], where), everywhere)
                 finite = np.isfinite(change).all()

@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 _SMALLEST_CHANGE = (
     1e-6  # of the residual norm: a stencil that changes less is widened, to stay above round-off
 )
-_WIDEST_STEP = 1e-2  # of the bounds' range
+_WIDEST_STEP = 1e-2  # of the bounds' range, to which a stencil that changes too little is widened
+_WIDEST_ASKED = 5e-2  # of the same, that may be asked for where the residuals are rough
 _STD_FRACTION = 1e-2  # a step shorter than 0.1 std lowers the loss by less than this times loss / r
 _ROUGH_FRACTION = 1e-1  # tolerated instead where no step lowers the loss: 0.3 std
 _SLOW_FRACTION = 0.5  # a step that gains less than this, in the same unit ...
@@ -274,9 +275,9 @@ class LeastSquares:
             raise UsageError("lsq: max_iterations, n_starts and prescreen must be at least 1")
         if not self.damping or min(self.damping + self.rescue) <= 0.0:
             raise UsageError("lsq: damping needs at least one factor, and all factors above 0")
-        if not (0.0 < self.forward_step <= _WIDEST_STEP and 0.0 < self.central_step <= _WIDEST_STEP):
+        if not (0.0 < self.forward_step <= _WIDEST_ASKED and 0.0 < self.central_step <= _WIDEST_ASKED):
             raise UsageError(
-                f"lsq: finite-difference steps are fractions of the range in (0, {_WIDEST_STEP:g}]"
+                f"lsq: finite-difference steps are fractions of the range in (0, {_WIDEST_ASKED:g}]"
             )
 
     @property
@@ -316,7 +317,8 @@ class LeastSquares:
         best = min(ends, key=lambda end: end.loss)
         if not self.confirm:
             return Outcome(best.termination, box.leave(best.u), best.loss)
-        steps = np.minimum(np.abs(best.steps) * self.central_step / self.forward_step, _WIDEST_STEP)
+        widest = max(_WIDEST_STEP, self.central_step)
+        steps = np.minimum(np.abs(best.steps) * self.central_step / self.forward_step, widest)
         end = self._descend(problem, evaluator, best.u, best.loss, steps, central)
         if end.model is None:
             return Outcome(end.termination)
@@ -477,7 +479,8 @@ def _linearise(
         )
         # A failed neighbour: look closer, and on the other side.
         closer = np.where(model.failed, -0.25 * steps, steps)
-        wider = np.sign(closer) * np.minimum(10.0 * np.abs(closer), _WIDEST_STEP)
+        size = np.abs(closer)
+        wider = np.sign(closer) * np.maximum(size, np.minimum(10.0 * size, _WIDEST_STEP))
         steps = np.where(model.faint & ~model.failed, wider, closer)
         if not scheme.central or not model.failed.any():
             break

@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, silent
+from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, silent
 from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
@@ -323,6 +323,8 @@ def hold_unidentifiable(
     result = LeastSquares(confirm=False, least_gain=ENOUGH).fit(
         conditional, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
     )
+    if result.termination is Termination.INTERRUPTED:
+        raise KeyboardInterrupt
     complete = conditional.complete(result.x[None])[0]
     free_loss, held_loss = problem.loss(np.stack([values, complete]))
     if not held_loss <= free_loss * WORSE:

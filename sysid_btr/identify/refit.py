@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget, Progress, silent
+from sysid_btr.estimators.base import Budget, Progress, Termination, silent
+from sysid_btr.estimators.evaluator import Evaluator, Stop
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.deferred import deferred_fit
@@ -81,7 +82,13 @@ def refit(
     iterations: int = 8,
     progress: Progress = silent,
 ) -> Fitted:
-    """Least squares from a first guess; `polish` runs to convergence with central differences."""
+    """Least squares from a first guess; `polish` runs to convergence with central differences.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The user interrupted; the study's journal, if it has one, holds what was simulated, except to polish.
+    """
     problem = study.train_problem(modifiers, np.clip(start, *_bounds(modifiers)))
     estimator = LeastSquares(
         confirm=polish,
@@ -91,11 +98,17 @@ def refit(
     )
     if study.free:
         estimator = walking(estimator)
-    rng, budget, journal = np.random.default_rng(0), Budget(), Journal()
+    rng, budget = np.random.default_rng(0), Budget()
+    # of arrays too large for a journal only the latest is kept, and another fit may still need its own
+    journal = Journal() if polish or study.journal is None else study.journal.section()
     if study.free and study.numerics != study.rough:
-        result = deferred_fit(problem, study.rough, estimator, rng=rng, budget=budget, journal=journal, progress=progress)
+        result = deferred_fit(
+            problem, study.rough, estimator, rng=rng, budget=budget, journal=journal, progress=progress
+        )
     else:
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
+    if result.termination is Termination.INTERRUPTED:
+        raise KeyboardInterrupt
     return judge(study, modifiers, result.x, evaluations=result.evaluations)
 
 
@@ -104,7 +117,12 @@ def best_start(study: Study, modifiers: tuple[Modifier, ...], starts: FloatArray
     starts = np.clip(starts, *_bounds(modifiers))
     if len(starts) == 1:
         return np.asarray(starts[0])
-    losses = np.nan_to_num(study.train_problem(modifiers, starts[0]).loss(starts), nan=np.inf)
+    problem = study.train_problem(modifiers, starts[0])
+    journal = Journal() if study.journal is None else study.journal.section()
+    try:
+        losses = Evaluator(problem, budget=Budget(), journal=journal, progress=silent).loss(starts)
+    except Stop:
+        raise KeyboardInterrupt from None
     best = int(np.argmin(losses))
     return np.asarray(starts[best if losses[best] < NOTICEABLE * losses[0] else 0])
 
@@ -166,9 +184,9 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     wrong for finding its cause.
     """
     problem = study.train_problem(fitted.modifiers)
-    worst: dict[tuple[str, str], float] = {}
-    for chi2, length, (_, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
-        key = (target.channel, target.joints[k])
+    worst: dict[tuple[str, str, str], float] = {}
+    for chi2, length, (i, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
+        key = (problem.episodes[i].replay.log.meta.mount, target.channel, target.joints[k])
         # noise is white; an error of the model is not, and says as little as its independent samples
         error = chi2 * length if memory and chi2 > CORRELATED else chi2
         worst[key] = max(worst.get(key, 1.0), float(np.sqrt(error)) if np.isfinite(error) else 1.0)

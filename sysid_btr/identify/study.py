@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError
+from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.walk import (
     FASTEST,
@@ -30,12 +31,14 @@ from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.models.scales import JointScale, Scales
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, make_targets
-from sysid_btr.replay.engine import Numerics, make_index
+from sysid_btr.replay.engine import Numerics, Replay, make_index
+from sysid_btr.replay.executor import HERE, Executor
 from sysid_btr.replay.numerics import choose_numerics
 
 TINY = 1e-9
-WIDE_STEP = 4e-3
-"""Finite-difference step, fraction of the range, that is wide against the roughness of impacts."""
+WIDE_STEP = 2e-2
+"""Finite-difference step, fraction of the range, that is wide against the roughness of impacts: at a fifth of it a
+third of a derivative by a mass is chance, which passes for information, and drags estimates along."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +53,12 @@ class Study:
     split : (s) for each held-out episode the time from which it is scored.
     channels : channels that are fitted.
     numerics : integrator and step; chosen by a convergence check.
-    inflation : (channel, joint) -> factor on its noise floor in what is minimised; 1 where silent. Keeps a
-        column that the model cannot explain yet from distorting parameters that others tell.
+    inflation : (mount, channel, joint) -> factor on its noise floor in what is minimised; 1 where silent. Keeps a
+        column that the model cannot explain yet from distorting parameters that others tell. What is wrong about
+        the ground is no error of a robot that hangs.
     numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
+    executor : where candidates are simulated.
+    journal : record of refits, from which an interrupted search goes on; None keeps none.
     """
 
     robot: Robot
@@ -63,7 +69,9 @@ class Study:
     numerics: Numerics
     numerics_error: float
     threads: int = 0
-    inflation: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    inflation: Mapping[tuple[str, str, str], float] = field(default_factory=dict)
+    executor: Executor = HERE
+    journal: Journal | None = None
 
     @cached_property
     def scales(self) -> Scales:
@@ -79,7 +87,8 @@ class Study:
         episodes = tuple(
             self._episode(log, modifiers, self.channels, 0.0, self.train_stop(log)) for log in self.train
         )
-        return ReplayProblem(episodes, nominal_start(modifiers) if start is None else start)
+        begin = nominal_start(modifiers) if start is None else start
+        return ReplayProblem(episodes, begin, self.executor)
 
     def holdout_problem(self, modifiers: Sequence[Modifier]) -> ReplayProblem:
         """What is predicted without having been fitted."""
@@ -87,7 +96,7 @@ class Study:
             self._episode(log, modifiers, self.channels, begin, np.inf)
             for log, begin in zip(self.holdout, self.split, strict=True)
         )
-        return ReplayProblem(episodes, nominal_start(modifiers))
+        return ReplayProblem(episodes, nominal_start(modifiers), self.executor)
 
     def train_stop(self, log: Log) -> float:
         return np.inf
@@ -106,9 +115,10 @@ class Study:
         if not targets:
             raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
         if self.inflation:
+            mount = log.meta.mount
             targets = tuple(
                 replace(
-                    t, sigma=t.noise * [self.inflation.get((t.channel, joint), 1.0) for joint in t.joints]
+                    t, sigma=t.noise * [self.inflation.get((mount, t.channel, joint), 1.0) for joint in t.joints]
                 )
                 for t in targets
             )
@@ -182,6 +192,7 @@ def make_study(
     channels: Sequence[str] = FITTED,
     numerics: Numerics | None = None,
     threads: int = 0,
+    executor: Executor = HERE,
 ) -> Study:
     """Lay out an identification.
 
@@ -193,6 +204,7 @@ def make_study(
     channels : channels to fit, of ``position``, ``velocity``, ``effort``.
     numerics : integrator and step; None chooses by a convergence check on the log.
     threads : worker threads, 0 for all cores.
+    executor : where candidates are simulated: this process, or what `open_executor` gives.
 
     Raises
     ------
@@ -229,6 +241,7 @@ def make_study(
         numerics=Numerics("RK4", 0.005),
         numerics_error=np.nan,
         threads=threads,
+        executor=executor,
     )
     if numerics is None:
         walks = [log for log in study.train if isinstance(log, Walk)]
@@ -251,12 +264,21 @@ def split_episodes(log: Log) -> list[Log]:
     return [log.window(rows.start, rows.stop) for rows in log.episodes() if rows.stop - rows.start > 1]
 
 
-def measure_scales(robot: Robot, logs: Sequence[Log], numerics: Numerics, threads: int = 0) -> Scales:
-    """Sizes at every joint, from replays of the plain model."""
+def measure_scales(
+    robot: Robot,
+    logs: Sequence[Log],
+    numerics: Numerics,
+    threads: int = 0,
+    replays: Sequence[Replay] | None = None,
+) -> Scales:
+    """Sizes at every joint, from replays of the plain model; `replays` with efforts, if they are special ones."""
     torque, velocity, acceleration, span = [], [], [], []
     measured: dict[str, list[FloatArray]] = {}
-    for log in logs:
-        replay = make_replay(robot.for_log(log), log, (), numerics, effort=True, threads=threads)
+    for i, log in enumerate(logs):
+        if replays is None:
+            replay: Replay = make_replay(robot.for_log(log), log, (), numerics, effort=True, threads=threads)
+        else:
+            replay = replays[i]
         outputs = replay.predict(np.zeros((1, 0)))
         joints = replay.index.joints
         assert outputs.effort is not None

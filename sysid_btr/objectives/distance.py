@@ -13,7 +13,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import UsageError
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.objectives.targets import Target
@@ -34,7 +34,7 @@ class MeanSquare:
     """Mean squared error over all samples that count, SI units squared, not whitened."""
 
     def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
-        error = (target.measured - predicted)[:, target.mask]
+        error = np.ascontiguousarray((target.measured - predicted)[:, target.mask])
         return np.asarray(np.mean(error**2, axis=1))
 
 
@@ -105,7 +105,7 @@ class Wasserstein:
                 continue
             measured = np.sort(target.measured[good, k])
             # NaN sorts to the end and stays: a failed candidate is not near anything
-            total += np.mean(np.abs(np.sort(predicted[:, good, k], axis=1) - measured), axis=1)
+            total += np.mean(np.abs(np.sort(_motion(predicted, good, k), axis=1) - measured), axis=1)
         return total
 
 
@@ -143,8 +143,13 @@ class Phi1:
         for k in range(joints):
             good = target.mask[:, k]
             real += float(self.fitness(target.measured[None, good, k])[0]) / joints
-            simulated += self.fitness(predicted[:, good, k]) / joints
+            simulated += self.fitness(_motion(predicted, good, k)) / joints
         return phi1(np.array([real]), simulated[:, None])
+
+
+def _motion(predicted: FloatArray, good: BoolArray, joint: int) -> FloatArray:
+    """Motions (m, samples) of one joint, row by row in memory: sums over a row have the same bits beside any others."""
+    return np.ascontiguousarray(predicted[:, good, joint])
 
 
 def phi1(real: FloatArray, simulated: FloatArray) -> FloatArray:
@@ -217,7 +222,9 @@ class DistanceProblem:
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         """Distances (m,) of candidates (m, p)."""
-        candidates = np.atleast_2d(candidates)
+        return self.whole.executor.run(DistanceProblem._loss, self, np.atleast_2d(candidates))
+
+    def _loss(self, candidates: FloatArray) -> FloatArray:
         total = np.zeros(len(candidates))
         for episode in self.whole.episodes:
             for rows, outputs in episode.replay.chunks(candidates):

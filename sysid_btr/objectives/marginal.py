@@ -69,9 +69,11 @@ class Projection:
 
     def whiten(self, part: FloatArray) -> FloatArray:
         """Residuals (m, k) with the start integrated out."""
-        expected = part + self.offset
+        # one product a candidate: the bits of a product of all would depend on how many there are
+        expected = (part + self.offset)[:, None]
         shrink = 1 - 1 / np.sqrt(1 + self.gain**2)
-        return np.asarray(self.weight * (expected - ((expected @ self.basis) * shrink) @ self.basis.T))
+        known = ((expected @ self.basis) * shrink) @ self.basis.T
+        return np.asarray(self.weight * (expected - known)[:, 0])
 
 
 def sensitivity(marginal: Marginal, window: int, targets: Sequence[Target]) -> tuple[IntArray, FloatArray]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from sysid_btr.models.modifier import Modifier, Outputs, Parameter
 from sysid_btr.objectives.marginal import Marginal, Projection, projections
 from sysid_btr.objectives.targets import Target
 from sysid_btr.replay.engine import Numerics, Replay
+from sysid_btr.replay.executor import HERE, Executor
 from sysid_btr.replay.structure import colour, limbs, parameter_limbs
 from sysid_btr.replay.together import chunks_together, parties
 
@@ -37,10 +39,19 @@ class Episode:
         """Whitening of every window whose start is uncertain."""
         return () if self.marginal is None else projections(self.marginal, self.targets)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process needs, so that it whitens with the same bits."""
+        return {name: getattr(self, name) for name in ("replay", "targets", "marginal", "projections")}
+
     def raw(self, outputs: Outputs) -> FloatArray:
         """Residuals over sigma, (m, r), target by target, sample by sample; starts are taken as they are."""
-        parts = [((t.measured - t.predicted(outputs)) / t.sigma)[:, t.mask] for t in self.targets]
-        return np.concatenate(parts, axis=1)
+        # row by row in memory: a sum over a row must have the same bits whatever candidates are beside it
+        result = np.empty((len(outputs.position), sum(int(t.mask.sum()) for t in self.targets)))
+        last = 0
+        for t in self.targets:
+            first, last = last, last + int(t.mask.sum())
+            result[:, first:last] = ((t.measured - t.predicted(outputs)) / t.sigma)[:, t.mask]
+        return result
 
     def whitened(self, outputs: Outputs) -> FloatArray:
         """Whitened residuals, (m, r), in the same order."""
@@ -77,10 +88,16 @@ class ReplayProblem:
     ----------
     episodes : replays under the same parameters.
     start : (p,) where a search begins.
+    executor : where candidates are simulated.
     """
 
     episodes: tuple[Episode, ...]
     start: FloatArray
+    executor: Executor = HERE
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process needs; it simulates there."""
+        return {"episodes": self.episodes, "start": self.start}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -114,7 +131,9 @@ class ReplayProblem:
 
     def residuals(self, candidates: FloatArray) -> FloatArray:
         """Whitened residuals, (m, r), of candidates (m, p); NaN rows where a candidate diverged."""
-        candidates = np.atleast_2d(candidates)
+        return self.executor.run(ReplayProblem._residuals, self, np.atleast_2d(candidates))
+
+    def _residuals(self, candidates: FloatArray) -> FloatArray:
         result = np.empty((len(candidates), self.count))
         for party in self._parties:
             for rows, outputs in self._simulate(party, candidates):
@@ -124,7 +143,9 @@ class ReplayProblem:
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         """Sum of squared whitened residuals, (m,); NaN where a candidate diverged."""
-        candidates = np.atleast_2d(candidates)
+        return self.executor.run(ReplayProblem._loss, self, np.atleast_2d(candidates))
+
+    def _loss(self, candidates: FloatArray) -> FloatArray:
         total = np.zeros(len(candidates))
         for party in self._parties:
             for rows, outputs in self._simulate(party, candidates):
@@ -211,12 +232,12 @@ class ReplayProblem:
         episodes = tuple(
             replace(e, replay=replace(e.replay, modifiers=tuple(modifiers))) for e in self.episodes
         )
-        return ReplayProblem(episodes, start)
+        return ReplayProblem(episodes, start, self.executor)
 
     def with_numerics(self, numerics: Numerics) -> ReplayProblem:
         """The same problem under another integrator or step."""
         episodes = tuple(replace(e, replay=replace(e.replay, numerics=numerics)) for e in self.episodes)
-        return ReplayProblem(episodes, self.start)
+        return replace(self, episodes=episodes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,14 @@ def _library() -> ctypes.CDLL | None:
     return None
 
 
+def hush() -> None:
+    """Keep MuJoCo silent for good, in a process that does nothing else: threads would undo each other's `quiet`."""
+    library = _library()
+    if library is not None:
+        now = library.mju_getLogConfig()
+        library.mju_setLogConfig(_LogConfig(False, False, now.logfile, now.topics))
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     """Run MuJoCo without its console and file messages; the settings are restored after."""
