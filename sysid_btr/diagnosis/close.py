@@ -352,7 +352,8 @@ def _scan(
         glance = shorten(study, GLANCE_SECONDS).train_problem(state.fitted.modifiers, values)
         seen = scan(glance, values, *linearise(glance, values, step=study.stencil), asked, study.scales)
         asked = [t.question for t in seen[:GLANCED]]
-    traces = scan(problem, values, residual, jacobian, asked, study.scales)
+    # what is left is the right integrator's; what an effect would change may be a little off
+    traces = scan(problem.with_numerics(study.cheap), values, residual, jacobian, asked, study.scales)
     if alike:
         # one hypothesis an effect, begun at its best working point: a refit's ladder holds other amounts
         best: dict[type[Effect], Trace] = {}
@@ -653,8 +654,11 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
     for refinement in range(MAX_REFINEMENTS + 1):
         fitted = state.fitted
         problem = study.train_problem(fitted.modifiers, fitted.values)
-        residual, jacobian = linearise(problem, fitted.values, step=study.stencil)
-        jacobian = np.nan_to_num(jacobian)
+        if refinement == 0:
+            residual, jacobian = linearise(problem, fitted.values, step=study.stencil)
+            jacobian = np.nan_to_num(jacobian)
+        else:  # what half the step changes in the derivatives is far less than what is known of them
+            residual = problem.residuals(fitted.values[None])[0]
         shift = numerics_shift(problem, fitted.values, jacobian, residual)
         if study.free:
             shift = np.hypot(shift, walking_error(study, problem, fitted.values, jacobian, residual))

@@ -26,6 +26,10 @@ NO_RESPONSE = 1e-6
 """Response, relative to the residual, below which a log cannot show an effect."""
 
 
+SLIGHT = 0.01
+"""Fraction of the best place's gain below which nothing costly is asked about a place."""
+
+
 @dataclass(frozen=True)
 class Question:
     """One effect at one place, or alike at several, at one working point."""
@@ -106,18 +110,34 @@ def scan(
     """
     basis = _orthonormal(jacobian)
     rest = residual - basis @ (basis.T @ residual)
-    traces: list[Trace] = []
-    for structural in (False, True):
-        chosen = [q for q in asked if q.effect.structural is structural]
-        if structural:
-            for batch in _by_structure(chosen, problem):
-                traces += _ask(problem, values, rest, basis, batch, scales)
-        else:
-            for has_law in (False, True):
-                batch = [q for q in chosen if q.effect.overrides("law") is has_law]
-                if batch:
-                    traces += _ask(problem, values, rest, basis, batch, scales)
+    plain = [q for q in asked if not _costly(q)]
+    traces = _ask(problem, values, rest, basis, plain, scales) if plain else []
+    costly = _where_something_is(plain, traces, [q for q in asked if _costly(q)])
+    laws = [q for q in costly if not q.effect.structural]
+    if laws:
+        traces += _ask(problem, values, rest, basis, laws, scales)
+    for batch in _by_structure([q for q in costly if q.effect.structural], problem):
+        traces += _ask(problem, values, rest, basis, batch, scales)
     return sorted(traces, key=lambda t: -t.gain)
+
+
+def _costly(question: Question) -> bool:
+    """Whether the effect acts step by step, or needs another model."""
+    return question.effect.structural or question.effect.overrides("law")
+
+
+def _where_something_is(plain: list[Question], traces: list[Trace], costly: list[Question]) -> list[Question]:
+    """Questions about places at which some simpler effect explains something, of what the best explains anywhere.
+
+    What an effect does at a joint follows its command, position, velocity, acceleration or load, and so does what one
+    of the simpler ones does there. A place that is passed over is asked about again once others are explained.
+    """
+    best = dict.fromkeys((q.place for q in plain if len(q.places) == 1), 0.0)
+    for trace in traces:
+        if len(trace.question.places) == 1:
+            best[trace.question.place] = max(best[trace.question.place], trace.gain)
+    least = SLIGHT * max(best.values(), default=0.0)
+    return [q for q in costly if len(q.places) > 1 or best.get(q.place, least) >= least]
 
 
 def _orthonormal(jacobian: FloatArray) -> FloatArray:

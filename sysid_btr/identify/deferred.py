@@ -33,11 +33,13 @@ class Corrected:
     Attributes
     ----------
     cheap : the problem under the cheap integrator.
-    offset : (r,) what its residuals lack at the point.
+    right : (r,) the right residuals at the point.
+    offset : (r,) what the cheap ones lack there.
     start : (p,) the point.
     """
 
     cheap: ReplayProblem
+    right: FloatArray
     offset: FloatArray
     start: FloatArray
 
@@ -73,7 +75,7 @@ def corrected(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> Co
     """The problem under a cheap integrator, right at `values` (p,)."""
     rough = problem.with_numerics(cheap)
     pair = [p.residuals(values[None])[0] for p in (problem, rough)]
-    return Corrected(rough, np.nan_to_num(pair[0] - pair[1]), values)
+    return Corrected(rough, pair[0], np.nan_to_num(pair[0] - pair[1]), values)
 
 
 def deferred_fit(
@@ -103,16 +105,18 @@ def deferred_fit(
     """
     bare = replace(estimator, confirm=False)
     near = corrected(problem, cheap, problem.start)
-    loss, evaluations = float(near.loss(near.start[None])[0]), 3
+    loss, evaluations = float(np.sum(near.right**2)), 2
     for _ in range(ROUNDS):
         result = bare.fit(near, rng=rng, budget=budget, journal=journal, progress=progress)
         evaluations += result.evaluations
         if result.termination in (Termination.INTERRUPTED, Termination.BUDGET_SPENT, Termination.NO_FINITE_CANDIDATE):
             return replace(result, evaluations=evaluations)
+        if np.array_equal(result.x, near.start):
+            break
         journal = journal.section()
         there = corrected(problem, cheap, result.x)
-        now = float(there.loss(result.x[None])[0])
-        evaluations += 3
+        now = float(np.sum(there.right**2))
+        evaluations += 2
         gain = (loss - now) / (now / len(there.offset))
         if gain >= 0:
             near, loss = there, now

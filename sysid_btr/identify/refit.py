@@ -101,9 +101,12 @@ def refit(
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish or study.journal is None else study.journal.section()
-    if study.free and study.numerics != study.rough:
+    # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
+    costly = any(type(m).overrides("law") or getattr(m, "structural", False) for m in modifiers)
+    cheaper = study.free or not (polish or costly)
+    if cheaper and study.numerics != study.cheap:
         result = deferred_fit(
-            problem, study.rough, estimator, rng=rng, budget=budget, journal=journal, progress=progress
+            problem, study.cheap, estimator, rng=rng, budget=budget, journal=journal, progress=progress
         )
     else:
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
@@ -204,6 +207,8 @@ def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitt
         if np.all(np.abs(np.log(fitted.train_columns / before)) < 0.02):
             break
     study = inflate(study, fitted)
+    if not study.free:  # only starts of windows are integrated out otherwise where columns count less
+        return study, fitted
     return study, judge(study, fitted.modifiers, fitted.values, fitted.evaluations)
 
 

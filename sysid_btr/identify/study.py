@@ -141,6 +141,13 @@ class Study:
         """A cheaper integrator for walks: good enough for first fits and for derivatives by the starts."""
         return Numerics("implicitfast", min(self.numerics.timestep, FASTEST)) if self.free else self.numerics
 
+    @property
+    def cheap(self) -> Numerics:
+        """Integrator and step of derivatives: a fraction of the cost, and as far off as a step of first order is."""
+        if self.free:
+            return self.rough
+        return replace(self.numerics, integrator="implicitfast") if self.numerics.integrator == "RK4" else self.numerics
+
     def relaid(self) -> Study:
         """The study with the windows of walks half a window later; held-out walks keep theirs."""
         return replace(
