@@ -28,7 +28,17 @@ from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift, walking_error
 from sysid_btr.identify.intervals import Estimate, estimates
-from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, paired_t, refit, robust_refit, shorten
+from sysid_btr.identify.refit import (
+    Fitted,
+    best_start,
+    inflate,
+    inflated,
+    judge,
+    paired_t,
+    refit,
+    robust_refit,
+    shorten,
+)
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.study import Study
 from sysid_btr.models.modifier import Modifier
@@ -144,9 +154,7 @@ def close(
     first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
     study = replace(first.study, journal=None if journal is None else journal.section())
     declared = first.modifiers
-    before = judge(study, declared, first.values, first.replays)
-    study = inflate(study, before)
-    before = judge(study, declared, first.values, first.replays)
+    study, before = inflated(study, judge(study, declared, first.values, first.replays))
     state = _State(before, ())
     steps = [StepRecord((), (), before.train, before.holdout)]
     replays = first.replays
@@ -372,8 +380,8 @@ def _try(
     starts = np.column_stack([np.tile(rest, (len(ladder), 1)), ladder])
     seconds = REFIT_SECONDS if len(starts) <= FEW_STARTS else LADDER_SECONDS
     start = best_start(shorten(study, seconds), modifiers, starts)
-    found = refit(shorten(study, REFIT_SECONDS), modifiers, start)
-    return judge(study, modifiers, found.values, found.evaluations + len(starts))
+    found = refit(shorten(study, REFIT_SECONDS), modifiers, start, judged=study)
+    return replace(found, evaluations=found.evaluations + len(starts))
 
 
 def _at_floor(fitted: Fitted) -> bool:
@@ -581,8 +589,7 @@ def _prune(
         others = state.effects[:at] + state.effects[at + 1 :]
         first = offset + sum(len(e.parameters) for e in state.effects[:at])
         values = np.delete(state.fitted.values, slice(first, first + len(effect.parameters)))
-        trial = refit(shorten(study, REFIT_SECONDS), (*declared, *others), values)
-        trial = judge(study, trial.modifiers, trial.values, trial.evaluations)
+        trial = refit(shorten(study, REFIT_SECONDS), (*declared, *others), values, judged=study)
         spent += trial.evaluations
         if not (_accepted(trial, state.fitted) or _accepted_wholly(trial, state.fitted)):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")

@@ -81,8 +81,11 @@ def refit(
     polish: bool = False,
     iterations: int = 8,
     progress: Progress = silent,
+    judged: Study | None = None,
 ) -> Fitted:
     """Least squares from a first guess; `polish` runs to convergence with central differences.
+
+    `judged` is the study whose data say how good the result is, where that is not the one that is fitted.
 
     Raises
     ------
@@ -112,7 +115,7 @@ def refit(
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
     if result.termination is Termination.INTERRUPTED:
         raise KeyboardInterrupt
-    return judge(study, modifiers, result.x, evaluations=result.evaluations)
+    return judge(judged or study, modifiers, result.x, evaluations=result.evaluations)
 
 
 def best_start(study: Study, modifiers: tuple[Modifier, ...], starts: FloatArray) -> FloatArray:
@@ -206,8 +209,13 @@ def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitt
         # held-out data must not decide how long is fitted
         if np.all(np.abs(np.log(fitted.train_columns / before)) < 0.02):
             break
+    return inflated(study, fitted)
+
+
+def inflated(study: Study, fitted: Fitted) -> tuple[Study, Fitted]:
+    """The study with inflated noise, and what was fitted as it judges that."""
     study = inflate(study, fitted)
-    if not study.free:  # only starts of windows are integrated out otherwise where columns count less
+    if not study.free:  # scores are in noise floors; only starts of windows take up more where columns count less
         return study, fitted
     return study, judge(study, fitted.modifiers, fitted.values, fitted.evaluations)
 
