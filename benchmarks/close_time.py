@@ -1,4 +1,4 @@
-"""`python -m benchmarks.close_time`: how long `close` takes on 40 s of a robot with 22 joints, by threads and by workers.
+"""`python -m benchmarks.close_time`: how long `close` takes on 40 s of 22 joints, by threads and by workers.
 
 Logs come from another rigid-body engine (`benchmarks.recorder`): one with an effect, one without. Rows are kept as
 they come, so that they can be measured one at a time; `--again` measures those anew that are there.

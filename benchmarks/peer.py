@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.replay import MASSES, SEED, Case, _round, load_case, machine, save
+from benchmarks.scaling import FINE, comb, log_of
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
@@ -28,7 +29,9 @@ from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.replay.engine import Numerics
 
-PARAMETERS = {"masses": MASSES, "kp": ("kp:*",)}
+PARAMETERS = {"arm": ("mass:*", "kp:*=shared", "kv:*=shared"), "masses": MASSES, "kp": ("kp:*",)}
+JOINTS = 6
+"""Of the arm."""
 TOLD = 1e-4
 """Step tolerance of the peer, as chosen by someone who has seen where its loss stops falling."""
 SLACK = 0.1
@@ -282,6 +285,12 @@ def compare(case: Case, expressions: Sequence[str], *, threads: int, repeats: in
     }
 
 
+def load_arm(seconds: float) -> Case:
+    """An arm of our own and a log of it with weaker servos."""
+    robot = comb(JOINTS, JOINTS)
+    return Case(robot, log_of(robot, seconds), FINE)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peer", description=__doc__.partition("\n")[0])
@@ -295,7 +304,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     result: dict[str, Any] = {"machine": machine(), "seed": SEED, "model": case.robot.name}
     for name in options.cases or PARAMETERS:
         result[name] = compare(
-            case, PARAMETERS[name], threads=options.threads, repeats=options.repeats, whole=options.whole
+            load_arm(options.seconds) if name == "arm" else case,
+            PARAMETERS[name],
+            threads=options.threads,
+            repeats=options.repeats,
+            whole=options.whole,
         )
     save("peer", result)
     return 0

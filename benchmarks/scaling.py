@@ -67,22 +67,26 @@ def nao() -> Robot:
 
 
 @cache
-def comb(joints: int) -> Robot:
-    """A held body with limbs of `LIMB` joints each, until there are as many as asked for."""
+def comb(joints: int, limb: int = LIMB) -> Robot:
+    """A held body with limbs of so many joints each, until there are as many as asked for."""
     import mujoco
 
     def link(k: int) -> str:
         axis = ("0 1 0", "1 0 0")[k % 2]
-        inner = link(k + 1) if (k + 1) % LIMB and k + 1 < joints else ""
+        inner = link(k + 1) if (k + 1) % limb and k + 1 < joints else ""
         return (
-            f'<body name="b{k}" pos="0 {0.05 * (k // LIMB) if k % LIMB == 0 else 0} -.1">'
+            f'<body name="b{k}" pos="0 {0.05 * (k // limb) if k % limb == 0 else 0} -.1">'
             f'<joint name="j{k}" axis="{axis}" damping=".05" armature=".008"/>'
             f'<geom type="box" size=".02 .02 .04" pos="0 0 -.05" mass=".1" contype="0" conaffinity="0"/>{inner}</body>'
         )
 
-    limbs = "".join(link(k) for k in range(0, joints, LIMB))
+    limbs = "".join(link(k) for k in range(0, joints, limb))
     servos = "".join(f'<position name="j{k}" joint="j{k}" kp="12" kv=".4"/>' for k in range(joints))
-    xml = f'<mujoco model="comb"><worldbody>{limbs}</worldbody><actuator>{servos}</actuator></mujoco>'
+    sensors = "".join(f'<jointpos name="position_j{k}" joint="j{k}"/>' for k in range(joints))
+    xml = (
+        f'<mujoco model="comb"><worldbody>{limbs}</worldbody><actuator>{servos}</actuator>'
+        f"<sensor>{sensors}</sensor></mujoco>"
+    )
     return robot_from_spec(f"comb{joints}", lambda: mujoco.MjSpec.from_string(xml))
 
 
