@@ -14,6 +14,7 @@ import toys
 
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
+from sysid_btr.diagnosis.scan import Question, Trace, where_something_is
 from sysid_btr.effects.armature import Armature
 from sysid_btr.effects.backlash import Backlash
 from sysid_btr.effects.base import Effect
@@ -325,6 +326,21 @@ def test_a_digital_servo_is_no_missing_effect(planted: bool) -> None:
     kp = next(p for p in found.parameters if p.name.startswith("kp"))
     assert abs(kp.value - TRUE_KP) < 0.01 * TRUE_KP
     assert found.study.numerics.servo_period == 0.004
+
+
+def test_costly_questions_are_asked_only_where_a_simple_effect_explains_something() -> None:
+    def question(effect: type[Effect], *places: str) -> Question:
+        return Question(effect, places, ((1.0,),))
+
+    def trace(place: str, gain: float) -> Trace:
+        nothing = np.zeros(0)
+        return Trace(question(CoulombFriction, place), nothing.astype(np.int64), nothing, nothing, gain, nothing)
+
+    plain = [question(CoulombFriction, p) for p in ("hip", "knee", "ankle")]
+    costly = [question(Backlash, p) for p in ("hip", "knee", "ankle", "toe")] + [question(Backlash, "ankle", "hip")]
+    asked = where_something_is(plain, [trace("knee", 500.0), trace("hip", 6.0), trace("ankle", 4.0)], costly)
+    assert [q.places for q in asked] == [("hip",), ("knee",), ("toe",), ("ankle", "hip")], "nothing is known of the toe"
+    assert where_something_is([], [], costly) == costly
 
 
 class Halt(BaseException):

@@ -112,7 +112,7 @@ def scan(
     rest = residual - basis @ (basis.T @ residual)
     plain = [q for q in asked if not _costly(q)]
     traces = _ask(problem, values, rest, basis, plain, scales) if plain else []
-    costly = _where_something_is(plain, traces, [q for q in asked if _costly(q)])
+    costly = where_something_is(plain, traces, [q for q in asked if _costly(q)])
     laws = [q for q in costly if not q.effect.structural]
     if laws:
         traces += _ask(problem, values, rest, basis, laws, scales)
@@ -126,7 +126,7 @@ def _costly(question: Question) -> bool:
     return question.effect.structural or question.effect.overrides("law")
 
 
-def _where_something_is(plain: list[Question], traces: list[Trace], costly: list[Question]) -> list[Question]:
+def where_something_is(plain: list[Question], traces: list[Trace], costly: list[Question]) -> list[Question]:
     """Questions about places at which some simpler effect explains something, of what the best explains anywhere.
 
     What an effect does at a joint follows its command, position, velocity, acceleration or load, and so does what one
