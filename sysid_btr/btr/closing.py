@@ -28,6 +28,8 @@ SAME = ("sensor_delay",)
 """Effects not asked for: commands that are played from rest do not tell a late encoder from a late command."""
 WORTH, ROUNDS = 0.05, 2
 """Fraction of some joint's error that an effect must explain to join the model, and effects that join at once."""
+LEFT = 0.75
+"""Fraction of the held-out mean squared error that effects may leave, to join."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +133,7 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
     joining = found[len(free) :]
     score = f"held-out position error {_error(closing.steps[0])} -> {_error(closing.steps[-1])} noise floors"
     spent = closing.replays * len(logs)
-    if not joining:
+    if not joining or closing.steps[-1].holdout > LEFT * closing.steps[0].holdout:
         return {"message": f"no effect is worth adding; {score}", "params": None, "simulations": spent}
     fitted = {id(m): v for m, v in found}
     model = [*((m, fitted.get(id(m), v)) for m, v in declared), *joining]
