@@ -84,6 +84,8 @@ REST = 0.1
 """Fraction of a column's excess that, left behind by effects that explain the rest, is told."""
 TRACE = 0.002
 """Fraction of a column's first excess that is not worth an effect."""
+PUSH = 0.05
+"""The same for what happens at some moment, once other effects are named."""
 STEP_GAIN = 0.03
 """An effect must remove this fraction of the held-out chi2, and of the excess at its joints."""
 STEP_T = 3.0
@@ -182,7 +184,13 @@ def close(
             replays += trials[-1][1].evaluations
         if not candidates or state.effects:
             candidates += _candidates(state.fitted, trials)
-        winner = _choose(state.fitted, [t for t in trials if _worth(before, state.fitted, t[1], worth)])
+        worthy = [
+            (h, f)
+            for h, f in trials
+            # what others leave unexplained at some moment looks like a push
+            if _worth(before, state.fitted, f, max(worth, PUSH) if h.effect.passing and state.effects else worth)
+        ]
+        winner = _choose(state.fitted, worthy)
         if winner is None:
             break
         hypothesis, fitted = winner
