@@ -84,6 +84,8 @@ REST = 0.1
 """Fraction of a column's excess that, left behind by effects that explain the rest, is told."""
 TRACE = 0.002
 """Fraction of a column's first excess that is not worth an effect."""
+FINEST = 5e-4
+"""s, shortest step that is tried where a hypothesis diverges."""
 PUSH = 0.05
 """The same for what happens at some moment, once other effects are named."""
 STEP_GAIN = 0.03
@@ -194,6 +196,8 @@ def close(
         if winner is None:
             break
         hypothesis, fitted = winner
+        if fitted.numerics != study.numerics:
+            study = replace(study, numerics=fitted.numerics)
         hypothesis, fitted, spent = _thin(study, state, hypothesis, fitted)
         replays += spent
         rivals = tuple(
@@ -387,9 +391,17 @@ def _try(
     ladder = hypothesis.ladder()
     starts = np.column_stack([np.tile(rest, (len(ladder), 1)), ladder])
     seconds = REFIT_SECONDS if len(starts) <= FEW_STARTS else LADDER_SECONDS
-    start = best_start(shorten(study, seconds), modifiers, starts)
-    found = refit(shorten(study, REFIT_SECONDS), modifiers, start, judged=study)
-    return replace(found, evaluations=found.evaluations + len(starts))
+    spent = 0
+    while True:
+        start = best_start(shorten(study, seconds), modifiers, starts)
+        found = refit(shorten(study, REFIT_SECONDS), modifiers, start, judged=study)
+        spent += found.evaluations + len(starts)
+        finer = study.numerics.halved()
+        given_up = study.free or finer.integrator == "Euler" or finer.timestep < FINEST
+        if np.isfinite(found.holdout) or given_up:
+            return replace(found, evaluations=spent)
+        # a stiff spring on a light body can be too fast for the step
+        study = replace(study, numerics=finer)
 
 
 def _at_floor(fitted: Fitted) -> bool:

@@ -16,6 +16,7 @@ from sysid_btr.identify.study import WIDE_STEP, Study
 from sysid_btr.identify.walk import Walk
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.replay.engine import Numerics
 
 CORRELATED = 1.5
 """Chi2 of a column beyond which its residual is an error of the model rather than noise."""
@@ -39,6 +40,7 @@ class Fitted:
     train_cells, holdout_cells : (columns, stretches) sums of squares over noise floor by stretch of half a
         second.
     evaluations : candidates simulated.
+    numerics : with which it was judged.
     """
 
     modifiers: tuple[Modifier, ...]
@@ -54,6 +56,7 @@ class Fitted:
     train_cells: FloatArray
     holdout_cells: FloatArray
     evaluations: int
+    numerics: Numerics
 
     @property
     def misfit(self) -> float:
@@ -178,6 +181,7 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
         train_cells=_by_cell(train, r),
         holdout_cells=_by_cell(holdout, s),
         evaluations=evaluations + 1,
+        numerics=study.numerics,
     )
 
 
