@@ -84,10 +84,10 @@ REST = 0.1
 """Fraction of a column's excess that, left behind by effects that explain the rest, is told."""
 TRACE = 0.002
 """Fraction of a column's first excess that is not worth an effect."""
-FINEST = 5e-4
-"""s, shortest step that is tried where a hypothesis diverges."""
 PUSH = 0.05
 """The same for what happens at some moment, once other effects are named."""
+FINEST = 5e-4
+"""s, shortest step that is tried where a hypothesis diverges."""
 STEP_GAIN = 0.03
 """An effect must remove this fraction of the held-out chi2, and of the excess at its joints."""
 STEP_T = 3.0

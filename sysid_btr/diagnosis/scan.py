@@ -24,8 +24,6 @@ BLOCK = 256
 """Questions whose responses are held at once."""
 NO_RESPONSE = 1e-6
 """Response, relative to the residual, below which a log cannot show an effect."""
-
-
 SLIGHT = 0.01
 """Fraction of the best place's gain below which nothing costly is asked about a place."""
 
