@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMNS = 3
+NAMED = 2
+"""Places listed in a label; of more, their number."""
 SHOWN = 30
 """Models drawn of each iteration, best last and darkest."""
 
@@ -100,4 +102,11 @@ def _parameter(axis: Axes, rounds: Sequence[Mapping[str, Any]], name: str, truth
     axis.plot(x, [r["model"][name] for r in rounds if name in r["model"]], color=ink())
     if truth is not None:
         axis.axhline(truth, color=PLAIN, lw=0.8, ls="--")
-    axis.set_ylabel(name)
+    axis.set_ylabel(_short(name))
+
+
+def _short(name: str) -> str:
+    """A parameter's name with at most a few of its places."""
+    kind, colon, places = name.partition(":")
+    listed = places.split(",")
+    return name if len(listed) <= NAMED else f"{kind}{colon}{len(listed)} places"
