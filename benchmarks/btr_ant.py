@@ -8,21 +8,19 @@ blindly. A seed that is finished is read, one that was stopped goes on; the tabl
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
 
+from benchmarks.btr_seeds import loop, study
 from sysid_btr.btr.controllers import Controller, ant_gait
-from sysid_btr.btr.loop import BackToReality, Settings, back_to_reality, model_search, papers_model_search
+from sysid_btr.btr.loop import BackToReality, Settings, model_search, papers_model_search
 from sysid_btr.btr.problems import ControllerProblem, Stage
-from sysid_btr.btr.result import btr_result, estimate_model
+from sysid_btr.btr.result import estimate_model
 from sysid_btr.btr.robot import HiddenRobot, Noise
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.world import make_world
@@ -30,8 +28,6 @@ from sysid_btr.estimators import Budget, GeneticAlgorithm, Journal, silent
 from sysid_btr.models.ant import UNKNOWN
 from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.robot import load_robot
-from sysid_btr.report.btr import draw_btr
-from sysid_btr.result import to_json
 
 RANGE = (0.75, 1.25)
 TASK = Walk(3.0)
@@ -65,62 +61,19 @@ class Plan:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.btr_ant", description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="to run; without, only the table")
-    parser.add_argument("--out", type=Path, default=Path("out/btr_ant"), help="folder of the runs")
-    parser.add_argument("--threads", type=int, default=1)
-    for name, value in vars(Plan()).items():
-        parser.add_argument(f"--{name}", type=type(value), default=value)
-    options = parser.parse_args(argv)
-    plan = Plan(**{name: getattr(options, name) for name in vars(Plan())})
-    for seed in options.seeds:
-        run_seed(seed, plan, options.out / f"seed_{seed:02d}", options.threads)
-    found = [json.loads(p.read_text()) for p in sorted(options.out.glob("seed_*/summary.json"))]
-    if found:
-        (options.out / "table.json").write_text(to_json(table(found)))
-    print(show(found))
-    return 0
+    return study("btr_ant", __doc__, Plan, run_seed, table, show, argv)
 
 
 def run_seed(seed: int, plan: Plan, out: Path, threads: int) -> dict[str, Any]:
     """One hidden ant: the loop and what it is compared with."""
-    done = out / "summary.json"
-    if done.exists():
-        content: dict[str, Any] = json.loads(done.read_text())
-        return content
-    out.mkdir(parents=True, exist_ok=True)
-    began, cpu = perf_counter(), process_time()
     model, space = load_robot("ant"), ant_gait()
     modifiers = parse_parameters([f"length:{','.join(UNKNOWN)}"], model)
     truth = np.random.default_rng([seed, 1000]).uniform(*RANGE, len(UNKNOWN))
     stage = Stage(make_world(model, TASK, modifiers, threads=threads), TASK, space)
     robot = HiddenRobot(stage.world, truth, TASK, space, Noise(), seed)
-    outcome = back_to_reality(
-        model,
-        modifiers,
-        robot,
-        space,
-        task=TASK,
-        settings=plan.settings,
-        seed=seed,
-        folder=out,
-        threads=threads,
-        say=lambda text: print(f"seed {seed}: {text}", flush=True),
-    )
-    result = btr_result(outcome)
-    (out / "result.json").write_text(to_json(result))
-    (out / "fig3.png").write_bytes(draw_btr(result, truth=dict(zip(outcome.iterations[0].names, truth, strict=True))))
-    summary = {
-        "seed": seed,
-        "plan": vars(plan),
-        "truth": truth,
-        **_of_loop(outcome, truth),
-        **compare(stage, robot, outcome, out, seed),
-        "cpu_s": process_time() - cpu,
-        "wall_s": perf_counter() - began,
-    }
-    done.write_text(to_json(summary))
-    return summary
+    names = [p.name for p in stage.parameters]
+    outcome = loop(model, modifiers, robot, plan.settings, out, threads, dict(zip(names, truth, strict=True)))
+    return {"truth": truth, **_of_loop(outcome, truth), **compare(stage, robot, outcome, out, seed)}
 
 
 def _of_loop(outcome: BackToReality, truth: np.ndarray) -> dict[str, Any]:

@@ -14,23 +14,21 @@ A seed that is finished is read, one that was stopped goes on; the table is of a
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter, process_time
+from time import process_time
 from typing import Any
 
 import numpy as np
 
+from benchmarks.btr_seeds import loop, study
 from benchmarks.paper_nao import V32
 from sysid_btr.btr.choice import get_choice, pool_of
 from sysid_btr.btr.controllers import Controller, NaoGait
-from sysid_btr.btr.loop import BackToReality, Settings, back_to_reality, controller_search, first_controller_search
+from sysid_btr.btr.loop import BackToReality, Settings, controller_search, first_controller_search
 from sysid_btr.btr.problems import ControllerProblem, Stage
-from sysid_btr.btr.result import btr_result
 from sysid_btr.btr.robot import HiddenRobot, Noise
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook
@@ -43,8 +41,6 @@ from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.robot import load_robot, servo_joints
 from sysid_btr.replay.engine import Numerics
 from sysid_btr.replay.log import set_parameters
-from sysid_btr.report.btr import draw_btr
-from sysid_btr.result import to_json
 
 TASK = Walk(8.0)
 FREE = (*(f"mass:{place}=shared" for place in V32), "kp:*=shared", "kv:*=shared")
@@ -82,24 +78,7 @@ class Plan:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; 0 when the table is written."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.btr_nao", description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="to run; without, only the table")
-    parser.add_argument("--out", type=Path, default=Path("out/btr_nao"), help="folder of the runs")
-    parser.add_argument("--threads", type=int, default=1)
-    for name, value in vars(Plan()).items():
-        parser.add_argument(f"--{name}", type=type(value), default=value)
-    parser.add_argument("--record", action="store_true", help="write the table beside the other results")
-    options = parser.parse_args(argv)
-    plan = Plan(**{name: getattr(options, name) for name in vars(Plan())})
-    for seed in options.seeds:
-        run_seed(seed, plan, options.out / f"seed_{seed:02d}", options.threads)
-    found = [json.loads(p.read_text()) for p in sorted(options.out.glob("seed_*/summary.json"))]
-    if found:
-        (options.out / "table.json").write_text(to_json(table(found)))
-        if options.record:
-            (Path(__file__).parent / "results" / "btr_nao.json").write_text(to_json(table(found)))
-    print(show(found))
-    return 0
+    return study("btr_nao", __doc__, Plan, run_seed, table, show, argv)
 
 
 def hidden_robot(seed: int, threads: int = 1) -> HiddenRobot:
@@ -115,41 +94,13 @@ def hidden_robot(seed: int, threads: int = 1) -> HiddenRobot:
 
 def run_seed(seed: int, plan: Plan, out: Path, threads: int) -> dict[str, Any]:
     """One hidden Nao: the loop and what it is compared with."""
-    done = out / "summary.json"
-    if done.exists():
-        content: dict[str, Any] = json.loads(done.read_text())
-        return content
-    out.mkdir(parents=True, exist_ok=True)
-    began, cpu = perf_counter(), process_time()
-    model, space, robot = load_robot("nao"), NaoGait(), hidden_robot(seed, threads)
+    cpu = process_time()
+    model, robot = load_robot("nao"), hidden_robot(seed, threads)
     modifiers = parse_parameters(list(FREE), model)
-    outcome = back_to_reality(
-        model,
-        modifiers,
-        robot,
-        space,
-        task=TASK,
-        settings=plan.settings,
-        seed=seed,
-        folder=out,
-        threads=threads,
-        say=lambda text: print(f"seed {seed} ({process_time() - cpu:.0f} s CPU): {text}", flush=True),
-    )
-    result = btr_result(outcome)
-    (out / "result.json").write_text(to_json(result))
-    (out / "fig3.png").write_bytes(draw_btr(result))
+    outcome = loop(model, modifiers, robot, plan.settings, out, threads)
     loop_s = process_time() - cpu
-    summary = {
-        "seed": seed,
-        "plan": vars(plan),
-        **_of_loop(outcome, robot),
-        **nominal_only(Stage(make_world(model, TASK, modifiers, threads=threads), TASK, space), robot, outcome, out),
-        "loop_cpu_s": loop_s,
-        "cpu_s": process_time() - cpu,
-        "wall_s": perf_counter() - began,
-    }
-    done.write_text(to_json(summary))
-    return summary
+    stage = Stage(make_world(model, TASK, modifiers, threads=threads), TASK, robot.space)
+    return {**_of_loop(outcome, robot), **nominal_only(stage, robot, outcome, out), "loop_cpu_s": loop_s}
 
 
 def _of_loop(outcome: BackToReality, robot: HiddenRobot) -> dict[str, Any]:

@@ -432,7 +432,7 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
 
     monkeypatch.setattr("sysid_btr.btr.closing._look", look)
     monkeypatch.setattr("sysid_btr.btr.loop.STUCK", -1.0)
-    monkeypatch.setattr("sysid_btr.btr.loop.UNEXPLAINED", 0.0)
+    monkeypatch.setattr("sysid_btr.btr.loop.EXPLAINED", 0.0)
     settings = replace(TINY, close=True)
     outcome = tiny(hidden(), tmp_path if disk else None, settings)
     assert asked == [2, 4]

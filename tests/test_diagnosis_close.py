@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 import toys
 
+from sysid_btr.diagnosis import close as closing
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
+from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.scan import Question, Trace, where_something_is
 from sysid_btr.effects.armature import Armature
 from sysid_btr.effects.backlash import Backlash
@@ -35,7 +37,8 @@ from sysid_btr.effects.speed_torque_limit import SpeedTorqueLimit
 from sysid_btr.effects.torque_limit import TorqueLimit
 from sysid_btr.effects.viscous_damping import ViscousDamping
 from sysid_btr.estimators import Journal
-from sysid_btr.identify.study import make_study
+from sysid_btr.identify.refit import judge
+from sysid_btr.identify.study import make_study, nominal_start
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.robot import load_robot
@@ -368,3 +371,17 @@ def test_a_closing_that_was_cut_off_goes_on_to_the_same_answer(when: str, tmp_pa
     np.testing.assert_array_equal(again.values, whole.values)
     assert again.verdict == whole.verdict
     assert again.replays == whole.replays
+
+
+def test_a_hypothesis_that_is_too_fast_for_the_step_is_tried_with_a_shorter_one() -> None:
+    plant = next(p for p in PLANTS if p.effect.name == "joint_compliance")
+    coarse = make_study(toys.leg(), [recorded(plant)], numerics=Numerics("RK4", 0.02))
+    declared = coarse.declare(TOY_FIT)
+    plain = judge(coarse, declared, nominal_start(declared))
+    soft = Hypothesis(JointCompliance, ("ankle",), False, np.array([0.003]), 0.0)
+    diverging = judge(coarse, (*declared, soft.modifier(coarse.scales)), np.append(plain.values, soft.start))
+    assert np.isfinite(plain.holdout)
+    assert np.isnan(diverging.holdout)
+    found = closing._try(coarse, closing._State(plain, ()), soft)
+    assert np.isfinite(found.holdout)
+    assert found.numerics.timestep < 0.02

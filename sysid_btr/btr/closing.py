@@ -23,7 +23,7 @@ from sysid_btr.session import Folder
 LOGS, FEWEST = 4, 2
 """Trials that are looked at, half of them held out, at most and at least."""
 EXPLAINED = 3.0
-"""Position error, in noise floors, of trials' beginnings up to which nothing is looked for."""
+"""Position error, in noise floors, of trials, and of their beginnings, up to which nothing is looked for."""
 SAME = ("sensor_delay",)
 """Effects not asked for: commands that are played from rest do not tell a late encoder from a late command."""
 WORTH, ROUNDS = 0.05, 2

@@ -19,7 +19,7 @@ import numpy as np
 from sysid_btr import __version__
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.choice import Pool, get_choice, pool_of
-from sysid_btr.btr.closing import Joined, join_effects
+from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
@@ -41,10 +41,8 @@ PATIENCE = 3
 """Iterations without progress after which disengagement is looked for."""
 UNTOLD = 0.2
 """Rank correlation of expected and real fitness up to which the model does not tell which controller is better."""
-UNEXPLAINED = 3.0
-"""Position error of the best model, in noise floors, above which something may be missing ..."""
 STUCK = 0.9
-"""... if Step 3 leaves more than this fraction of the loss it began with, or it was not looked for yet."""
+"""What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
 
 STEPS = {"controllers": 1, "models": 3}
 """Searches of an iteration by the paper's numbers."""
@@ -401,7 +399,7 @@ class _Loop:
         """
         losses = _all_of(journal)[1]
         little = float(np.min(losses)) > STUCK * float(losses[0]) or not any(r.joined for r in self.rounds)
-        return little and bool(problem.targets) and problem.noise(self.values) > UNEXPLAINED
+        return little and bool(problem.targets) and problem.noise(self.values) > EXPLAINED
 
     def _close(self, number: int, values: FloatArray) -> str:
         """Name missing effects and add them to the model; what was found, in words.

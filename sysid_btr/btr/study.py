@@ -7,7 +7,7 @@ no reconstruction of the base, as windows of a walk do; those cost many times th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -103,12 +103,7 @@ class TrialStudy(Study):
         self, log: Log, modifiers: Sequence[Modifier], channels: tuple[str, ...], begin: float, end: float
     ) -> Episode:
         run = self._replay(log, modifiers)
-        targets = make_targets(log, run.index.joints, channels, 0.0)
-        mount = log.meta.mount
-        targets = tuple(
-            replace(t, sigma=t.noise * [self.inflation.get((mount, t.channel, joint), 1.0) for joint in t.joints])
-            for t in targets
-        )
+        targets = self.with_inflation(log, make_targets(log, run.index.joints, channels, 0.0))
         time = log.time - log.time[0]
         return Episode(run, tuple(t.window(begin, end, time) for t in targets))
 

@@ -344,7 +344,7 @@ def _promising(
 
 
 def _scan(
-    study: Study, state: _State, library: Sequence[type[Effect]], alike: bool = False
+    study: Study, state: _State, library: Sequence[type[Effect]], alike: bool
 ) -> tuple[list[Trace], FloatArray]:
     values = state.fitted.values
     problem = shorten(study, SCAN_SECONDS).train_problem(state.fitted.modifiers, values)

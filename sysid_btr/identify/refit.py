@@ -106,7 +106,7 @@ def refit(
         estimator = walking(estimator)
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
-    journal = Journal() if polish or study.journal is None else study.journal.section()
+    journal = Journal() if polish else study.section()
     # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
     costly = any(type(m).overrides("law") or getattr(m, "structural", False) for m in modifiers)
     cheaper = study.free or not (polish or costly)
@@ -127,9 +127,8 @@ def best_start(study: Study, modifiers: tuple[Modifier, ...], starts: FloatArray
     if len(starts) == 1:
         return np.asarray(starts[0])
     problem = study.train_problem(modifiers, starts[0])
-    journal = Journal() if study.journal is None else study.journal.section()
     try:
-        losses = Evaluator(problem, budget=Budget(), journal=journal, progress=silent).loss(starts)
+        losses = Evaluator(problem, budget=Budget(), journal=study.section(), progress=silent).loss(starts)
     except Stop:
         raise KeyboardInterrupt from None
     best = int(np.argmin(losses))

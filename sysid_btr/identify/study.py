@@ -30,7 +30,7 @@ from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.models.scales import JointScale, Scales
 from sysid_btr.objectives.problem import Episode, ReplayProblem
-from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, make_targets
+from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, Target, make_targets
 from sysid_btr.replay.engine import Numerics, Replay, make_index
 from sysid_btr.replay.executor import HERE, Executor
 from sysid_btr.replay.numerics import choose_numerics
@@ -114,14 +114,7 @@ class Study:
         targets = make_targets(log, replay.index.joints, present, 0.0 if isinstance(log, Walk) else WARM_UP)
         if not targets:
             raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
-        if self.inflation:
-            mount = log.meta.mount
-            targets = tuple(
-                replace(
-                    t, sigma=t.noise * [self.inflation.get((mount, t.channel, joint), 1.0) for joint in t.joints]
-                )
-                for t in targets
-            )
+        targets = self.with_inflation(log, targets)
         if begin > 0 or np.isfinite(end):
             time = log.time - log.time[0]
             targets = tuple(t.window(begin, end, time) for t in targets)
@@ -130,6 +123,20 @@ class Study:
             targets = tuple(replace(t, mask=t.mask & inside) for t in targets)
             return Episode(replay, targets, log.marginal)
         return Episode(replay, targets)
+
+    def with_inflation(self, log: Log, targets: tuple[Target, ...]) -> tuple[Target, ...]:
+        """Targets of a log with the noise that columns of its mount are given."""
+        mount, factor = log.meta.mount, self.inflation
+        if not factor:
+            return targets
+        return tuple(
+            replace(t, sigma=t.noise * [factor.get((mount, t.channel, joint), 1.0) for joint in t.joints])
+            for t in targets
+        )
+
+    def section(self) -> Journal:
+        """What the next search keeps its record in."""
+        return Journal() if self.journal is None else self.journal.section()
 
     @property
     def free(self) -> bool:

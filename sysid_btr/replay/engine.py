@@ -352,7 +352,7 @@ class Replay:
         if states.effort is not None and measured is None:
             known = slice(len(grid.state) - 1)
             asked = command[:, grid.state[known]]
-            states.effort[:, known] = drive.plain(asked, states.motor[:, known], states.motor_velocity[:, known])
+            states.effort[:, known] = servo_torque(rig, asked, states.motor[:, known], states.motor_velocity[:, known])
         states.repeat_last_effort()
         return states
 
@@ -476,14 +476,6 @@ class _Drive:
         torque, d = np.zeros(self._shape), self.driven
         torque[:, d] = self.gear * (kp * command[:, d] + constant + stiffness * qpos[:, d] + damping * qvel[:, d])
         return torque
-
-    def plain(self, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
-        """The servo's own torque at many states, (m, states, joints)."""
-        d, gear = self.driven, self.gear[:, None]
-        kp, constant, stiffness, damping = (part[:, None] for part in self._law)
-        torque = np.zeros(qpos.shape)
-        torque[..., d] = gear * (kp * command[..., d] + constant + stiffness * qpos[..., d] + damping * qvel[..., d])
-        return np.clip(torque, self.low[:, None], self.high[:, None])
 
     def torque(self, step: Step, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
         """Servo torque at the start of the step, under the step's laws."""
