@@ -15,7 +15,7 @@ A seed that is finished is read, one that was stopped goes on; the table is of a
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
@@ -25,6 +25,7 @@ import numpy as np
 
 from benchmarks.btr_seeds import loop, study
 from benchmarks.paper_nao import V32
+from sysid_btr.btr.beginnings import model_fit
 from sysid_btr.btr.choice import get_choice, pool_of
 from sysid_btr.btr.controllers import Controller, NaoGait
 from sysid_btr.btr.loop import BackToReality, Settings, controller_search, first_controller_search
@@ -36,7 +37,7 @@ from sysid_btr.btr.world import make_world
 from sysid_btr.effects.base import Effect
 from sysid_btr.effects.command_delay import CommandDelay
 from sysid_btr.effects.coulomb_friction import CoulombFriction
-from sysid_btr.estimators import Budget, CmaEs, Journal, silent
+from sysid_btr.estimators import Budget, CmaEs, Estimator, Journal, silent
 from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.robot import load_robot, servo_joints
 from sysid_btr.replay.engine import Numerics
@@ -47,6 +48,21 @@ FREE = (*(f"mass:{place}=shared" for place in V32), "kp:*=shared", "kv:*=shared"
 DELAY, GAIN, FRICTION = 0.025, 0.9, (0.1, 0.3)
 """s, of all commands; kp over its nominal; Nm, of each joint."""
 HIDDEN = Numerics("implicitfast", 0.002)
+CONTROLLERS: Mapping[str, Callable[[int], tuple[Estimator, Estimator]]] = {
+    "ga": lambda generations: (
+        replace(first_controller_search(), generations=generations),
+        replace(controller_search(len(NaoGait().names)), generations=generations),
+    ),
+    "cmaes": lambda generations: (
+        CmaEs(sigma=0.3, population=20, max_generations=generations),
+        CmaEs(sigma=0.1, population=20, max_generations=generations),
+    ),
+}
+"""Step 1 in the first iteration and in the others, by its generations of 20."""
+MODELS: Mapping[str, Estimator] = {
+    "lsq": model_fit(),
+    "cmaes": CmaEs(population=12, max_generations=8, sigma=0.1),
+}
 FRICTIONS = ("coulomb_friction", "stribeck_friction", "load_friction")
 
 
@@ -56,19 +72,22 @@ class Plan:
 
     iterations: int = 5
     trials: int = 4
-    memory: int = 4
+    memory: int = 8
     distance: str = "likelihood"
     choice: str = "fittest"
+    models: str = "lsq"
+    controllers: str = "ga"
+    generations: int = 11
 
     @property
     def settings(self) -> Settings:
-        first = first_controller_search()
+        first, controllers = CONTROLLERS[self.controllers](self.generations)
         return Settings(
             iterations=self.iterations,
             trials=self.trials,
             first=first,
-            controllers=replace(first, mutation=controller_search(len(NaoGait().names)).mutation),
-            models=CmaEs(population=12, max_generations=8, sigma=0.1),
+            controllers=controllers,
+            models=MODELS[self.models],
             distance=self.distance,
             choice=self.choice,
             memory=self.memory,
@@ -100,7 +119,7 @@ def run_seed(seed: int, plan: Plan, out: Path, threads: int) -> dict[str, Any]:
     outcome = loop(model, modifiers, robot, plan.settings, out, threads)
     loop_s = process_time() - cpu
     stage = Stage(make_world(model, TASK, modifiers, threads=threads), TASK, robot.space)
-    return {**_of_loop(outcome, robot), **nominal_only(stage, robot, outcome, out), "loop_cpu_s": loop_s}
+    return {**_of_loop(outcome, robot), **nominal_only(stage, robot, outcome, plan, out), "loop_cpu_s": loop_s}
 
 
 def _of_loop(outcome: BackToReality, robot: HiddenRobot) -> dict[str, Any]:
@@ -124,16 +143,17 @@ def _of_loop(outcome: BackToReality, robot: HiddenRobot) -> dict[str, Any]:
     }
 
 
-def nominal_only(stage: Stage, robot: HiddenRobot, outcome: BackToReality, out: Path) -> dict[str, Any]:
+def nominal_only(stage: Stage, robot: HiddenRobot, outcome: BackToReality, plan: Plan, out: Path) -> dict[str, Any]:
     """Controllers searched in the nominal model alone, with as many simulated walks and as many real trials."""
     settings = outcome.settings
     nominal = np.array([p.nominal for p in stage.parameters])
-    generations = max(round(outcome.simulations / (settings.iterations * 20)), 11)
+    generations = max(round(outcome.simulations / (settings.iterations * 20)), plan.generations)
+    first, others = CONTROLLERS[plan.controllers](generations)
     book = TrialBook(out / "nominal_trials")
     blind = stage.space.start
     best_of_all, spent = -np.inf, 0
     for number in range(1, settings.iterations + 1):
-        search = replace(settings.first if number == 1 else settings.controllers, generations=generations)  # type: ignore[type-var]
+        search = first if number == 1 else others
         start = stage.space.start if book.best is None else book.best.controller.values
         journal = Journal(out / f"nominal_{number:02d}.jsonl")
         found = search.fit(

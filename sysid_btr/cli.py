@@ -773,8 +773,14 @@ def btr(
         str, typer.Option("--search", metavar="NAME", help="For controllers: ga (the paper) or cmaes.")
     ] = "ga",
     model_search: Annotated[
-        str, typer.Option("--model-search", metavar="NAME", help="For models: cmaes, or ga (the paper).")
-    ] = "cmaes",
+        str | None,
+        typer.Option(
+            "--model-search",
+            metavar="NAME",
+            help="For models: cmaes, ga (the paper), or lsq, which looks at the trials' first 2 s. "
+            "[default: lsq for a likelihood, else cmaes]",
+        ),
+    ] = None,
     requirement: Annotated[
         float | None, typer.Option("--requirement", metavar="M/S", help="Stop once the robot walks this fast.")
     ] = None,

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.trials import Tried
-from sysid_btr.diagnosis.closing import StepRecord
+from sysid_btr.effects.base import Effect
 from sysid_btr.errors import SysidError
-from sysid_btr.estimators.base import Progress, silent
+from sysid_btr.estimators.base import Budget, Progress, Termination, silent
+from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot
 from sysid_btr.session import Folder
+
+if TYPE_CHECKING:
+    from sysid_btr.btr.study import TrialStudy
 
 LOGS, FEWEST = 4, 2
 """Trials that are looked at, half of them held out, at most and at least."""
@@ -29,7 +33,8 @@ SAME = ("sensor_delay",)
 WORTH, ROUNDS = 0.05, 2
 """Fraction of some joint's error that an effect must explain to join the model, and effects that join at once."""
 LEFT = 0.75
-"""Fraction of the held-out mean squared error that effects may leave, to join."""
+"""Fraction of the held-out mean squared error that effects may leave, to join, and that amounts of their own at every
+place may leave of what one for all leaves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,26 +136,68 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
         return {"message": f"missing effects could not be looked for: {error}", "params": None}
     found = _split(closing.modifiers, closing.values)
     joining = found[len(free) :]
-    score = f"held-out position error {_error(closing.steps[0])} -> {_error(closing.steps[-1])} noise floors"
+    first, last = closing.steps[0].holdout, closing.steps[-1].holdout
     spent = closing.replays * len(logs)
-    if not joining or closing.steps[-1].holdout > LEFT * closing.steps[0].holdout:
-        return {"message": f"no effect is worth adding; {score}", "params": None, "simulations": spent}
+    if not joining or last > LEFT * first:
+        message = f"no effect is worth adding; {_score(first, last)}"
+        return {"message": message, "params": None, "simulations": spent}
+    found, last, apart = _tell_apart(study, found, len(free), last)
+    joining, spent = found[len(free) :], spent + apart * len(logs)
     fitted = {id(m): v for m, v in found}
     model = [*((m, fitted.get(id(m), v)) for m, v in declared), *joining]
     modifiers = tuple(m for m, _ in model)
     numbers = np.array([x for _, v in model for x in v])
     told = "; ".join(
         f"{m.name} at {len(m.places)} places: "
-        + ", ".join(f"{x:.3g} {p.unit}" for p, x in zip(m.parameters, v, strict=True))
+        + _amounts(m, v)
         for m, v in joining
     )
     return {
-        "message": f"joined the model: {told}; {score}",
+        "message": f"joined the model: {told}; {_score(first, last)}",
         "simulations": spent,
         "params": params_of(Identified(study, modifiers, numbers, (), ())),
         "modifiers": modifiers,
         "values": numbers,
     }
+
+
+def _tell_apart(
+    study: TrialStudy, found: list[tuple[Modifier, tuple[float, ...]]], declared: int, left: float
+) -> tuple[list[tuple[Modifier, tuple[float, ...]]], float, int]:
+    """The model with amounts of their own at every place for effects where held-out trials want that.
+
+    `found` are modifiers and values, the declared ones first; `left` is the mean squared held-out error so far.
+    Returned with that of the model, and the candidates that it took.
+    """
+    from sysid_btr.btr.beginnings import beginnings, model_fit
+    from sysid_btr.identify.refit import judge
+
+    spent = 0
+    for i in range(declared, len(found)):
+        effect, values = found[i]
+        if not (isinstance(effect, Effect) and effect.shared):
+            continue
+        own = _own_amounts(effect)
+        trying = [*found[:i], (own, values * len(effect.places)), *found[i + 1 :]]
+        modifiers = tuple(m for m, _ in trying)
+        problem = beginnings(study, modifiers, np.array([x for _, v in trying for x in v]))
+        estimate = model_fit().fit(
+            problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
+        )
+        if estimate.termination is Termination.INTERRUPTED:
+            raise KeyboardInterrupt
+        judged = judge(study, modifiers, estimate.x, estimate.evaluations)
+        spent += judged.evaluations
+        if judged.holdout < LEFT * left:
+            found, left = _split(modifiers, estimate.x), judged.holdout
+    return found, left, spent
+
+
+def _own_amounts(effect: Effect) -> Effect:
+    """The effect with an amount for every place, within the bounds of the one for all."""
+    bare = replace(effect, shared=False, known=())
+    known = (*effect.parameters,) * len(effect.places)
+    return replace(bare, known=tuple(replace(k, name=p.name) for k, p in zip(known, bare.parameters, strict=True)))
 
 
 def _split(modifiers: Sequence[Modifier], values: FloatArray) -> list[tuple[Modifier, tuple[float, ...]]]:
@@ -163,8 +210,19 @@ def _split(modifiers: Sequence[Modifier], values: FloatArray) -> list[tuple[Modi
     return result
 
 
-def _error(step: StepRecord) -> str:
-    return f"{np.sqrt(step.holdout):.3g}"
+def _amounts(modifier: Modifier, values: tuple[float, ...]) -> str:
+    """Values in words: each kind's, and where it has several places their range."""
+    own = np.reshape(values, (-1, len(modifier.kinds)))
+    units = [p.unit for p in modifier.parameters]
+    return ", ".join(
+        f"{low:.3g} {unit}" if low == high else f"{low:.3g} to {high:.3g} {unit}"
+        for low, high, unit in zip(own.min(axis=0), own.max(axis=0), units, strict=False)
+    )
+
+
+def _score(before: float, after: float) -> str:
+    """Mean squares over noise floors, in words."""
+    return f"held-out position error {np.sqrt(before):.3g} -> {np.sqrt(after):.3g} noise floors"
 
 
 def _direct(found: dict[str, Any]) -> Joined:

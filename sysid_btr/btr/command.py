@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sysid_btr.btr.loop import Settings
     from sysid_btr.btr.robot import Robot
     from sysid_btr.btr.task import Walk
+    from sysid_btr.estimators.base import Estimator
     from sysid_btr.models.robot import Robot as Model
 
 KEPT = ("journals", "trials", "closings")
@@ -44,7 +45,7 @@ class Asked:
     distance: str
     choice: str
     search: str
-    model_search: str
+    model_search: str | None
     requirement: float | None
     close: bool
     seed: int
@@ -52,17 +53,23 @@ class Asked:
 
     def settings(self, space: ControllerSpace) -> Settings:
         """How the loop searches."""
-        from sysid_btr.btr.loop import Settings, controller_search, papers_model_search
+        from sysid_btr.btr.beginnings import model_fit
+        from sysid_btr.btr.loop import LIKELIHOOD, Settings, controller_search, model_search, papers_model_search
         from sysid_btr.estimators.cma_es import CmaEs
 
-        for flag, name in (("--search", self.search), ("--model-search", self.model_search)):
-            if name not in ("ga", "cmaes"):
-                raise UsageError(f"{flag} {name}: there are ga and cmaes")
+        models: dict[str, Estimator] = {"cmaes": model_search(), "ga": papers_model_search(), "lsq": model_fit()}
+        by_distance = "lsq" if self.distance == LIKELIHOOD else "cmaes"
+        search = by_distance if self.model_search is None else self.model_search
+        if self.search not in ("ga", "cmaes"):
+            raise UsageError(f"--search {self.search}: there are ga and cmaes")
+        if search not in models:
+            raise UsageError(f"--model-search {search}: there are {', '.join(models)}")
         trials = self.trials or (BY_FITNESS if self.distance == "phi1" else BY_SENSORS)
         settings = Settings(
             iterations=self.iterations,
             trials=trials,
             controllers=controller_search(len(space.names)),
+            models=models[search],
             distance=self.distance,
             choice=self.choice,
             memory=max(trials, 4),
@@ -75,8 +82,6 @@ class Asked:
                 first=CmaEs(sigma=0.3, population=20, max_generations=11),
                 controllers=CmaEs(sigma=0.1, population=20, max_generations=11),
             )
-        if self.model_search == "ga":
-            settings = replace(settings, models=papers_model_search())
         return settings
 
     def robot(self, task: Walk, space: ControllerSpace) -> Robot:

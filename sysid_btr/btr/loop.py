@@ -18,21 +18,25 @@ import numpy as np
 
 from sysid_btr import __version__
 from sysid_btr._typing import FloatArray
+from sysid_btr.btr.beginnings import Beginnings, beginnings
 from sysid_btr.btr.choice import Pool, get_choice, pool_of
 from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
-from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, Stage
+from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
+from sysid_btr.btr.study import early_logs, trial_study
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.errors import InterruptedRun, UsageError
-from sysid_btr.estimators.base import Budget, Estimator, FitResult, Problem, Progress, Termination, silent
+from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, silent
+from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.models.modifier import Modifier, Parameter
 from sysid_btr.models.robot import Robot as Model
 from sysid_btr.objectives.distance import get_distance
@@ -44,8 +48,12 @@ UNTOLD = 0.2
 STUCK = 0.9
 """What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
 
-STEPS = {"controllers": 1, "models": 3}
-"""Searches of an iteration by the paper's numbers."""
+STEPS = {"controllers": 1, "models": 3, "models_again": 4}
+"""Searches of an iteration by the paper's numbers; after effects joined the model least squares goes on with it."""
+LIKELIHOOD = "likelihood"
+"""The distance by which Step 3 explains the first seconds of trials, and is biased by the last model."""
+SPOILT = 1.5
+"""Times the error of the fitness that the last model foresees of the trials, above which a model is not taken."""
 
 
 FLIPS, BITS = 4.3, 8
@@ -87,8 +95,9 @@ class Settings:
     iterations : at most.
     trials : controllers tried in each (m in the paper); with a distance of sensors one or two will do.
     first, controllers : Step 1 in the first iteration and in the others.
-    models : Step 3.
-    distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse``, ``wasserstein`` or ``likelihood``.
+    models : Step 3; least squares needs a likelihood.
+    distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse`` or ``wasserstein`` of whole trials, or the
+        ``likelihood`` of their first seconds, biased by the last model.
     choice : of trials, ``fittest`` or ``disagreement``.
     memory : trials that Step 3 explains, the newest first; those before are taken evenly.
     rivals : candidate models that may disagree.
@@ -115,6 +124,8 @@ class Settings:
             raise UsageError("btr: iterations, trials, memory and rivals must be at least 1")
         if self.close and self.correct:
             raise UsageError("btr: with a linear correction the model stays as it is; nothing can be added to it")
+        if _by_residuals(self.models) and self.distance != LIKELIHOOD:
+            raise UsageError(f"btr: least squares minimises a likelihood; give --distance {LIKELIHOOD}, or cmaes or ga")
         get_choice(self.choice)
         if self.distance != FITNESS:
             get_distance(self.distance)
@@ -328,9 +339,12 @@ class _Loop:
         problem = self._model_problem(self._remembered(), before)
         searched = self._search_model(number, problem)
         if searched is not None and self.settings.close and self._stuck(problem, searched[1]):
+            stage = self.stage
             joined = self._close(number, before)
             if joined:
                 problem = self._model_problem(self._remembered(), self.values)
+                if problem.distance == LIKELIHOOD and self.stage is not stage:
+                    self._search_model(number, problem, "models_again")
         report = self._report(number, found, last, tried, transfer, problem, searched, joined)
         return replace(report, population_names=names)
 
@@ -364,15 +378,27 @@ class _Loop:
         controllers = np.array([t.controller.values for t in tried]).reshape(len(tried), width)
         return ModelProblem(self.stage, controllers, [t.trial for t in tried], self.settings.distance, start)
 
-    def _search_model(self, number: int, problem: ModelProblem) -> tuple[FloatArray, Journal] | None:
+    def _search_model(
+        self, number: int, problem: ModelProblem, step: str = "models"
+    ) -> tuple[FloatArray, Journal] | None:
         """Step 3; None where there is nothing to explain, or the model stays as it is."""
         if self.settings.correct or not problem.trials:
             return None
         if problem.distance != FITNESS and not problem.targets:
             return None
-        found, journal = self._search(number, "models", self.settings.models, problem)
+        asked: ModelProblem | Beginnings = problem
+        if problem.distance == LIKELIHOOD:
+            logs = early_logs(self.stage, self._remembered(), self.settings.memory)
+            if not logs:
+                return None
+            study = trial_study(self.stage, logs, (), self.threads)
+            asked = beginnings(study, self.stage.world.modifiers, problem.start)
+        found, journal = self._search(number, step, self.settings.models, asked)
         if not np.isfinite(found.loss):
             return None
+        foreseen = replace(problem, distance=FITNESS).loss(np.stack([problem.start, found.x]))
+        if problem.distance == LIKELIHOOD and not foreseen[1] <= SPOILT * foreseen[0]:
+            return problem.start, journal  # what comes later in the trials tells against it
         self.values = found.x
         candidates, losses = _all_of(journal)
         order = np.argsort(losses, kind="stable")
@@ -380,7 +406,9 @@ class _Loop:
         self.rivals = _distinct(candidates[order])[: self.settings.rivals]
         return found.x, journal
 
-    def _search(self, number: int, step: str, estimator: Estimator, problem: Problem) -> tuple[FitResult, Journal]:
+    def _search(
+        self, number: int, step: str, estimator: Estimator, problem: SearchProblem
+    ) -> tuple[FitResult, Journal]:
         label = f"{number:02d}_{STEPS[step]}_{step}"
         path = None if self.folder is None else self.folder / "journals" / f"{label}.jsonl"
         journal = Journal(path, fingerprint=f"{self._print}/{label}")
@@ -389,7 +417,7 @@ class _Loop:
         found = estimator.fit(problem, rng=rng, budget=Budget(), journal=journal, progress=noted)
         if found.termination is Termination.INTERRUPTED:
             raise InterruptedRun(f"interrupted in iteration {number}, {step}; what is done is kept")
-        self.simulations += found.evaluations * (len(problem.trials) if isinstance(problem, ModelProblem) else 1)
+        self.simulations += found.evaluations * problem.runs
         return found, journal
 
     def _stuck(self, problem: ModelProblem, journal: Journal) -> bool:
@@ -492,6 +520,12 @@ def _rank_correlation(a: FloatArray, b: FloatArray) -> float:
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         return 0.0
     return float(np.corrcoef(x, y)[0, 1])
+
+
+def _by_residuals(estimator: Estimator) -> bool:
+    """Whether an estimator needs residuals, and not only a loss."""
+    stages = estimator.stages if isinstance(estimator, Chain) else (estimator,)
+    return any(isinstance(stage, LeastSquares) for stage in stages)
 
 
 def _all_of(journal: Journal) -> tuple[FloatArray, FloatArray]:

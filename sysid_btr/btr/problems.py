@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.robot import Trial
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.world import World
+from sysid_btr.estimators.base import Problem
 from sysid_btr.io.log import Log
 from sysid_btr.models.modifier import Parameter
 from sysid_btr.objectives.distance import Distance, get_distance, phi1
@@ -62,6 +64,15 @@ def _blocks(count: int, size: int = 256) -> list[slice]:
     return [slice(first, min(first + size, count)) for first in range(0, count, size)]
 
 
+class SearchProblem(Problem, Protocol):
+    """A problem of Step 1 or 3."""
+
+    @property
+    def runs(self) -> int:
+        """Simulations that one candidate takes."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class ControllerProblem:
     """Step 1: the loss of a controller is its negative fitness in one model.
@@ -77,6 +88,10 @@ class ControllerProblem:
     model: FloatArray
     start: FloatArray
     correction: Callable[[FloatArray], FloatArray] | None = None
+
+    @property
+    def runs(self) -> int:
+        return 1
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -120,6 +135,10 @@ class ModelProblem:
     def names(self) -> tuple[str, ...]:
         return tuple(p.name for p in self.stage.parameters)
 
+    @property
+    def runs(self) -> int:
+        return len(self.trials)
+
     @cached_property
     def lower(self) -> FloatArray:
         return np.array([p.lower for p in self.stage.parameters])
@@ -144,7 +163,7 @@ class ModelProblem:
             usable = [i for i, t in enumerate(self.trials) if t.outcome != "crashed"]
             real = np.array([self.trials[i].fitness for i in usable])
             return phi1(real, self.stage.fitness(self.controllers[usable], candidates))
-        return self._sensors(get_distance(self.distance) or Likelihood(), candidates)
+        return self._sensors(get_distance(self.distance) or SumOfSquares(), candidates)
 
     def noise(self, candidate: FloatArray) -> float:
         """Root mean square of the position error over the noise floor: one for a model that misses nothing."""
@@ -170,21 +189,6 @@ class SumOfSquares:
     def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
         error = ((target.measured - predicted) / target.sigma)[:, target.mask]
         return np.asarray(np.sum(error**2, axis=1))
-
-
-@dataclass(frozen=True)
-class Likelihood:
-    """Negative log-likelihood, up to a constant, of Gaussian errors whose size each joint and trial has for itself.
-
-    The prior of the size says the noise floor, with the weight of as many samples as there are. A walk that a whole
-    replay cannot follow for long, whatever the model, so counts little, as does a joint that the model does badly.
-    """
-
-    def __call__(self, target: Target, predicted: FloatArray) -> FloatArray:
-        error = np.where(target.mask, (target.measured - predicted) / target.sigma, 0.0)
-        count = target.mask.sum(axis=0)
-        size = np.einsum("mnk,mnk->mk", error, error) / np.maximum(count, 1)
-        return np.asarray(np.log1p(size) @ count.astype(np.float64))
 
 
 def on_clock(log: Log, time: FloatArray) -> Log:

@@ -1,0 +1,86 @@
+"""Step 3 by a likelihood: the trials' first seconds, biased by the last model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.estimators.chain import Chain
+from sysid_btr.estimators.lsq import LeastSquares
+from sysid_btr.identify.study import Study
+from sysid_btr.models.modifier import Modifier
+from sysid_btr.objectives.problem import ReplayProblem
+
+PULL = 0.3
+"""Standard deviation, fraction of its last value, within which a parameter is expected to lie."""
+FAR = 5e-2
+"""Finite-difference step, fraction of the range, that sees over what impacts do to a trial."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beginnings:
+    """Step 3 by a likelihood: the trials' beginnings, biased by the last model.
+
+    The bias is a Gaussian prior about the last model, and keeps what a few trials do not tell where it was.
+
+    Attributes
+    ----------
+    data : the trials.
+    """
+
+    data: ReplayProblem
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.data.names
+
+    @property
+    def runs(self) -> int:
+        return len(self.data.episodes)
+
+    @property
+    def lower(self) -> FloatArray:
+        return self.data.lower
+
+    @property
+    def upper(self) -> FloatArray:
+        return self.data.upper
+
+    @property
+    def start(self) -> FloatArray:
+        """(p,) the last model."""
+        return self.data.start
+
+    @cached_property
+    def width(self) -> FloatArray:
+        """(p,) standard deviation of the prior."""
+        return np.maximum(PULL * np.abs(self.start), self.data.scale)
+
+    def residuals(self, candidates: FloatArray) -> FloatArray:
+        """Whitened residuals (m, r + p) of candidates (m, p); those of the prior come last."""
+        residuals = self.data.residuals(candidates)
+        pull = (np.atleast_2d(candidates) - self.start) / self.width
+        pull[np.isnan(residuals).any(axis=1)] = np.nan
+        return np.hstack([residuals, pull])
+
+    def loss(self, candidates: FloatArray) -> FloatArray:
+        """Sum of squared residuals (m,); NaN where a candidate diverged."""
+        return np.asarray(np.sum(self.residuals(candidates) ** 2, axis=1))
+
+
+def beginnings(study: Study, modifiers: Sequence[Modifier], start: FloatArray) -> Beginnings:
+    """The fitted trials of a study, as a problem that begins with a model (p,) and is biased by it."""
+    return Beginnings(study.train_problem(modifiers, start))
+
+
+def model_fit() -> Chain:
+    """Least squares for the beginnings of trials of a robot that walks.
+
+    Impacts roughen them: differences over wide steps find the valley, fine ones what of its bottom can be found.
+    """
+    fine = LeastSquares(confirm=False, max_iterations=8, tolerance=1e-4)
+    return Chain((replace(fine, forward_step=FAR), fine))
