@@ -432,7 +432,7 @@ def test_a_walk_and_a_held_log_together_tell_more_than_either() -> None:
     def deviations(*logs: Log) -> np.ndarray:
         study = make_study(robot, logs, numerics=Numerics("RK4", 0.005), threads=2)
         problem = study.train_problem(study.declare(["mass:LKneePitch", "mass:LHipPitch"]))
-        residual, jacobian = linearise(problem, problem.start, step=study.stencil)
+        residual, jacobian = linearise(problem, problem.start, step=study.stencil(problem.modifiers))
         found = estimates(problem.parameters, problem.start, jacobian, residual, problem.blocks)
         return np.array([e.std for e in found])
 

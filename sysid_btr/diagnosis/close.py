@@ -348,7 +348,7 @@ def _scan(
 ) -> tuple[list[Trace], FloatArray]:
     values = state.fitted.values
     problem = shorten(study, SCAN_SECONDS).train_problem(state.fitted.modifiers, values)
-    residual, jacobian = linearise(problem, values, step=study.stencil)
+    residual, jacobian = linearise(problem, values, step=study.stencil(state.fitted.modifiers))
     places = {
         "joint": joint_names(study.robot),
         "servo": servo_joints(study.robot),
@@ -370,7 +370,8 @@ def _scan(
     ]
     if study.free and len(asked) > GLANCED:
         glance = shorten(study, GLANCE_SECONDS).train_problem(state.fitted.modifiers, values)
-        seen = scan(glance, values, *linearise(glance, values, step=study.stencil), asked, study.scales)
+        linear = linearise(glance, values, step=study.stencil(glance.modifiers))
+        seen = scan(glance, values, *linear, asked, study.scales)
         asked = [t.question for t in seen[:GLANCED]]
     # what is left is the right integrator's; what an effect would change may be a little off
     traces = scan(problem.with_numerics(study.cheap), values, residual, jacobian, asked, study.scales)
@@ -682,7 +683,7 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
         fitted = state.fitted
         problem = study.train_problem(fitted.modifiers, fitted.values)
         if refinement == 0:
-            residual, jacobian = linearise(problem, fitted.values, step=study.stencil)
+            residual, jacobian = linearise(problem, fitted.values, step=study.stencil(fitted.modifiers))
             jacobian = np.nan_to_num(jacobian)
         else:  # what half the step changes in the derivatives is far less than what is known of them
             residual = problem.residuals(fitted.values[None])[0]

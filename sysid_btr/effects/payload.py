@@ -1,4 +1,4 @@
-"""A load that a body carries: a point mass at a place in the body's frame."""
+"""A load that a body carries: a mass at a place in the body's frame, with an inertia of its own."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class Payload(Effect):
     """Native: the body's mass, centre of mass and inertia are those of body and load together.
 
     The parameters are the mass and the position of the load in the frame of the body, whose origin is
-    the joint it hangs on where the model follows the usual convention.
+    the joint it hangs on where the model follows the usual convention, and the inertia about its own centre, alike
+    about all axes, as of a ball. A load taken for a point would pay for its size with its mass and place.
     """
 
     name: ClassVar[str] = "payload"
@@ -39,6 +40,7 @@ class Payload(Effect):
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("mass", "kg", 0.0, 0.0, 2.0, 0.05),
         *(Kind(axis, "m", 0.0, -0.3, 0.3, 0.02) for axis in "xyz"),
+        Kind("inertia", "kg m^2", 0.0, 0.0, 0.01, 2e-5),
     )
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("mass", "nothing, where the load sits at the body's centre of mass"),
@@ -49,13 +51,13 @@ class Payload(Effect):
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         m, d = 0.05, 0.05
-        return (((m, 0.0, 0.0, 0.0), (m, d, 0.0, 0.0), (m, 0.0, d, 0.0), (m, 0.0, 0.0, d)),)
+        return (tuple((m, *place, 0.0) for place in ((0.0, 0.0, 0.0), (d, 0.0, 0.0), (0.0, d, 0.0), (0.0, 0.0, d))),)
 
     @classmethod
     def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
         """The probe's directions are equal loads at several places: amounts add, places average."""
         total = float(np.sum(amounts))
-        moment = np.dot(amounts, [[d[0] * x for x in d[1:]] for d in probe])
+        moment = np.dot(amounts, [[d[0] * x for x in d[1:4]] for d in probe])
         size = float(np.linalg.norm(moment))
         lever = size / (total * probe[0][0]) if total > 0 else 0.0
         if not LEVERS[0] <= lever <= LEVERS[1]:
@@ -63,7 +65,7 @@ class Payload(Effect):
             if size == 0:
                 return None
             mass = min(size / ARM, cls.kinds[0].upper)
-            return np.array([mass, *(moment / mass)])
+            return np.array([mass, *(moment / mass), 0.0])
         kinds = cls.sized(scale)
         values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
         values[0] *= total
@@ -77,7 +79,7 @@ class Payload(Effect):
         ipos, iquat = rig.array("body_ipos"), rig.array("body_iquat")
         for place, name in enumerate(self.places):
             body = rig.model.body(name).id
-            added, where = values[:, place, 0], values[:, place, 1:]
+            added, where, ball = values[:, place, 0], values[:, place, 1:4], values[:, place, 4]
             loaded = added > 0
             if not loaded.any():
                 continue
@@ -87,6 +89,7 @@ class Payload(Effect):
             rotation = _matrices(iquat[:, body])
             tensor = np.einsum("mij,mj,mkj->mik", rotation, inertia[:, body], rotation)
             tensor = tensor + _point(own, centre - joint) + _point(added, where - joint)
+            tensor = tensor + ball[:, None, None] * np.eye(3)
             principal, axes = np.linalg.eigh(tensor)
             axes[np.linalg.det(axes) < 0, :, 0] *= -1
             mass[loaded, body] = total[loaded]

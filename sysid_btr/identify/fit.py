@@ -160,7 +160,7 @@ def fit(
         goal = problem if distance is None else DistanceProblem(problem, distance)
         result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
     replays = result.evaluations + rough
-    step = study.stencil
+    step = study.stencil(modifiers)
     values, jacobian, residual = _at_optimum(problem, result, step)
     for _ in range(MAX_REFINEMENTS):
         shift = numerics_shift(problem, values, jacobian, residual)
@@ -286,7 +286,7 @@ def placement_shift(study: Study, modifiers: tuple[Modifier, ...], values: Float
     """
     relaid = study.relaid().settled(modifiers, values, held=False)
     problem = relaid.train_problem(modifiers, values)
-    residual, jacobian = linearise(corrected(problem, study.rough, values), values, step=study.stencil)
+    residual, jacobian = linearise(corrected(problem, study.rough, values), values, step=study.stencil(modifiers))
     if not np.isfinite(jacobian).all():
         return np.full(len(values), np.inf)
     span = problem.upper - problem.lower

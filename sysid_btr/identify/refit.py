@@ -104,6 +104,9 @@ def refit(
     )
     if study.free:
         estimator = walking(estimator)
+    elif any(getattr(m, "structural", False) for m in modifiers):
+        step = study.stencil(modifiers)
+        estimator = replace(estimator, forward_step=step, central_step=step)
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()

@@ -40,6 +40,9 @@ WIDE_STEP = 2e-2
 """Finite-difference step, fraction of the range, that is wide against the roughness of impacts: at a fifth of it a
 third of a derivative by a mass is chance, which passes for information, and drags estimates along."""
 
+ROUGH_STEP = 1e-2
+"""The same against teeth that meet: from there on, wider ones tell of no less information."""
+
 
 @dataclass(frozen=True, eq=False)
 class Study:
@@ -164,10 +167,11 @@ class Study:
             ),
         )
 
-    @property
-    def stencil(self) -> float:
+    def stencil(self, modifiers: Sequence[Modifier]) -> float:
         """Finite-difference step, fraction of a parameter's range: wide where impacts roughen the objective."""
-        return WIDE_STEP if self.free else LeastSquares.central_step
+        if self.free:
+            return WIDE_STEP
+        return ROUGH_STEP if any(getattr(m, "structural", False) for m in modifiers) else LeastSquares.central_step
 
     def settled(
         self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True, anew: bool = True

@@ -132,7 +132,7 @@ def posterior(
     parameters = _parameters(fit)
     chosen = choose_priors(parameters, priors or {}, fit.study.robot.priors)
     problem = fit.study.train_problem(fit.modifiers, fit.values)
-    x, residual, jacobian, extra = settle(problem, fit.values, fit.study.stencil)
+    x, residual, jacobian, extra = settle(problem, fit.values, fit.study.stencil(fit.modifiers))
     likelihood = make_likelihood(problem, x, residual, jacobian, problem.blocks, fit.numerics_shift)
     drawn = sample(
         replace(problem, start=x),

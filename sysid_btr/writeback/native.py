@@ -87,11 +87,11 @@ class AddedBody(Modifier):
     name: ClassVar[str] = "payload"
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        for place, (mass, *where) in zip(self.places, self.loads, strict=True):
+        for place, (mass, x, y, z, ball) in zip(self.places, self.loads, strict=True):
             if mass > 0:
-                body = spec.body(place).add_body(name=f"payload_{place}", pos=list(where))
+                body = spec.body(place).add_body(name=f"payload_{place}", pos=[x, y, z])
                 body.explicitinertial = True
-                body.ipos, body.inertia = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+                body.ipos, body.inertia = [0.0, 0.0, 0.0], [ball, ball, ball]
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         # not in the spec: what the compiler derives from masses, such as dampings, is that of the bare robot
