@@ -224,7 +224,8 @@ def test_armature_is_inertia_without_weight() -> None:
     assert rest(Armature, [0.02], seconds=6.0) == pytest.approx(rest(Armature, [0.0], seconds=6.0), abs=1e-8)
 
 
-def test_a_payload_is_a_body_that_is_fixed_to_the_link() -> None:
+@pytest.mark.parametrize("own", [0.0, 3e-4])
+def test_a_payload_is_a_body_that_is_fixed_to_the_link(own: float) -> None:
     where = (0.03, -0.02, -0.08)
 
     def load(spec: Any) -> None:
@@ -232,12 +233,12 @@ def test_a_payload_is_a_body_that_is_fixed_to_the_link() -> None:
         body.explicitinertial = True
         body.mass = 0.18
         body.ipos = [0.0, 0.0, 0.0]
-        body.inertia = [1e-12, 1e-12, 1e-12]
+        body.inertia = [max(own, 1e-12)] * 3
 
     log = swing(LEG_JOINTS, seconds=0.8)
     effect = Payload.at(("knee",), dict.fromkeys(LEG_JOINTS, SCALE))
     np.testing.assert_allclose(
-        position(leg(), log, [effect], [0.18, *where]), position(with_spec(leg(), load), log), atol=1e-9
+        position(leg(), log, [effect], [0.18, *where, own]), position(with_spec(leg(), load), log), atol=1e-9
     )
 
 
@@ -245,7 +246,7 @@ def test_a_payload_hangs_at_its_lever() -> None:
     q = solve(
         lambda q: KP * (COMMAND - q) - gravity(q) - 0.2 * GRAVITY * (0.15 * np.sin(q) - 0.05 * np.cos(q))
     )
-    assert rest(Payload, [0.2, 0.05, 0.0, -0.15], seconds=6.0) == pytest.approx(q, abs=1e-8)
+    assert rest(Payload, [0.2, 0.05, 0.0, -0.15, 0.0], seconds=6.0) == pytest.approx(q, abs=1e-8)
 
 
 def test_a_shifted_centre_of_mass_changes_the_lever() -> None:
@@ -474,7 +475,27 @@ def test_play_lets_the_link_fall_to_the_side_where_gravity_pulls(
 ) -> None:
     play, side = 0.06, np.sign(command)
     q = solve(lambda q: KP * (command - (q + side * play / 2)) - gravity(q))
-    assert rest(effect, [play], command) == pytest.approx(q, abs=1e-3)
+    assert rest(effect, [play, 0.0], command) == pytest.approx(q, abs=1e-3)
+
+
+@pytest.mark.parametrize("effect", [Backlash, BacklashMotor])
+@pytest.mark.parametrize("command", [0.6, -0.6])
+def test_teeth_that_meet_give_way_in_proportion_to_the_torque(effect: type[Effect], command: float) -> None:
+    play, softness, side = 0.06, 0.02, np.sign(command)
+    q = solve(lambda q: KP * (command - (q + side * play / 2 + softness * gravity(q))) - gravity(q))
+    assert rest(effect, [play, softness], command, seconds=6.0) == pytest.approx(q, abs=2e-5)
+
+
+def test_soft_stops_do_not_depend_on_the_step() -> None:
+    """What a stop adds to the inertia vanishes with the step."""
+    log, fine = swing(), Numerics("RK4", 0.00025)
+    exact = position(pendulum(), log, [at_arm(Backlash)], [0.03, 0.004], fine)
+    errors = [
+        np.abs(position(pendulum(), log, [at_arm(Backlash)], [0.03, 0.004], Numerics("RK4", step)) - exact).max()
+        for step in (0.005, 0.00125)
+    ]
+    assert errors[1] < 0.4 * errors[0]
+    assert errors[0] < 1e-3
 
 
 @pytest.mark.parametrize("effect", [Backlash, BacklashMotor])
@@ -483,7 +504,7 @@ def test_within_its_play_the_link_swings_freely(effect: type[Effect]) -> None:
     time = np.arange(601) * 0.01
     log = make_log(time, {"command.arm": 0.01 * np.sin(2 * time)})
     undamped = with_spec(pendulum(), lambda s: setattr(s.joint("arm"), "damping", [0, 0, 0]))
-    moved = position(undamped, log, [at_arm(effect)], [0.06])
+    moved = position(undamped, log, [at_arm(effect)], [0.06, 0.0])
     assert np.abs(moved).max() < 1e-3
     assert np.abs(position(undamped, log)).max() > 8e-3
 
@@ -501,7 +522,7 @@ def test_a_fitted_damping_acts_once_when_a_gear_has_two_sides(effect: type[Effec
     log = swing()
     damping = parse_parameters(["damping:arm"], pendulum())
     built = with_spec(pendulum(), lambda s: setattr(s.joint("arm"), "damping", [0.4, 0, 0]))
-    small = [0.02]
+    small = [0.02] * len(effect.kinds)
     np.testing.assert_allclose(
         position(pendulum(), log, [*damping, at_arm(effect)], [0.4, *small]),
         position(built, log, [at_arm(effect)], small),

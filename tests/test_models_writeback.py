@@ -291,7 +291,7 @@ def test_the_file_compiles_to_the_model_that_was_replayed(own: Path, out: Folder
 @given(
     scale=st.lists(st.floats(0.3, 3.0), min_size=9, max_size=9),
     friction=st.floats(0, 2),
-    load=st.tuples(st.floats(1e-4, 1), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
+    load=st.tuples(st.floats(1e-4, 1), *[st.floats(-0.2, 0.2)] * 3, st.floats(0, 1e-3)),
     tilt=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
 )
 def test_round_trip(
@@ -356,7 +356,7 @@ def test_compilers_that_derive_masses_are_told_not_to(
 
 
 def test_stored_states_keep_their_joints(own: Path) -> None:
-    made = draft(model_of(study_of(load_robot(str(own))), (effect(Backlash, "hip"),), [0.02]))
+    made = draft(model_of(study_of(load_robot(str(own))), (effect(Backlash, "hip"),), [0.02, 0.001]))
     after = mujoco.MjModel.from_xml_string(made.text().decode())
     assert [after.joint(i).name for i in range(4)] == ["hip", "hip__link", "knee", "ankle"]
     np.testing.assert_array_equal(after.key_qpos[0], [0.1, 0, 0.2, 0.3])
@@ -389,11 +389,11 @@ def test_a_users_model_is_never_overwritten(own: Path) -> None:
 
 EXACT: dict[str, tuple[type[Effect], tuple[str, ...], list[float], str]] = {
     "dry friction": (CoulombFriction, ("knee",), [0.2], 'frictionloss="0.2"'),
-    "backlash": (Backlash, ("knee",), [0.03], 'name="knee__link"'),
+    "backlash": (Backlash, ("knee",), [0.03, 0.002], 'name="knee__link"'),
     "compliance": (JointCompliance, ("hip",), [0.02], 'name="hip__link"'),
     "spring": (JointSpring, ("knee",), [1.5, 0.3], "stiffness="),
     "torque limit": (TorqueLimit, ("ankle",), [0.3], 'forcerange="-0.3 0.3"'),
-    "payload": (Payload, ("knee",), [0.2, 0.05, 0.01, -0.1], 'name="payload_knee"'),
+    "payload": (Payload, ("knee",), [0.2, 0.05, 0.01, -0.1, 2e-4], 'name="payload_knee"'),
     "tilt": (GravityTilt, ("robot",), [0.05, -0.03], 'gravity="'),
     "constant torque": (ConstantForce, ("knee",), [0.3], "springref="),
     "constant torque without a spring": (ConstantForce, ("hip",), [-0.3], "springref="),
@@ -580,7 +580,7 @@ def test_plain_mujoco_moves_with_all_effects_at_once(own: Path, out: Folder, tmp
         effect(TorqueLimit, "hip"),
         effect(GravityTilt, "robot"),
     )
-    values = [0.1, 0.02, 0.1, 0.02, 0.01, -0.05, 0.3, 0.2, 0.15, 0.018, 0.021, 0.03, 1.5, 0.02, 0.03]
+    values = [0.1, 0.02, 0.001, 0.1, 0.02, 0.01, -0.05, 1e-4, 0.3, 0.2, 0.15, 0.018, 0.021, 0.03, 1.5, 0.02, 0.03]
     free = parse_parameters(["mass:knee", "kp:*=shared", "damping:hip"], study.robot)
     model = model_of(study, (*free, *effects), [1.2, 0.9, 0.08, *values])
     written = save_model(out, draft(model))
@@ -606,10 +606,10 @@ def test_every_change_is_told_in_a_line(fitted: Any, out: Folder) -> None:
 
 
 def test_what_makes_room_for_an_effect_is_told_with_it(own: Path) -> None:
-    made = draft(model_of(study_of(load_robot(str(own))), (effect(Backlash, "hip"),), [0.02]))
+    made = draft(model_of(study_of(load_robot(str(own))), (effect(Backlash, "hip"),), [0.02, 0.001]))
     lines = [c.line for c in made.changes]
-    assert "joint hip damping 0.05 -> 0 (backlash (link): play 0.02 rad)" in lines
-    assert "joint hip__link added: backlash (link) of hip: play 0.02 rad" in lines
+    assert "joint hip damping 0.05 -> 0 (backlash (link): play 0.02 rad, softness 0.001 rad/Nm)" in lines
+    assert "joint hip__link added: backlash (link) of hip: play 0.02 rad, softness 0.001 rad/Nm" in lines
 
 
 def test_a_spring_that_is_a_constant_torque_is_called_that(own: Path) -> None:
@@ -634,14 +634,14 @@ def test_effects_read_back_too(own: Path, out: Folder) -> None:
     robot = load_robot(str(own))
     study = study_of(robot)
     effects = (effect(Backlash, "knee"), replace(effect(Payload, "hip")))
-    model = model_of(study, effects, [0.02, 0.1, 0.01, 0.02, 0.03])
+    model = model_of(study, effects, [0.02, 0.001, 0.1, 0.01, 0.02, 0.03, 1e-4])
     out.write("params.json", json.dumps(params_of(model), default=list))
     params = read_params(out.path / "params.json", robot)
     assert [type(m) for m in params.modifiers] == [Backlash, Payload]
     assert params.by_name["payload.mass:hip"] == 0.1
     given, unused = starts_from(params, effects[0].parameters)
-    assert given == ["backlash:knee=0.02"]
-    assert len(unused) == 4
+    assert given == ["backlash.play:knee=0.02", "backlash.softness:knee=0.001"]
+    assert len(unused) == 5
 
 
 def test_parameter_files_that_do_not_fit_are_refused(own: Path, out: Folder) -> None:

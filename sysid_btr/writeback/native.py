@@ -87,17 +87,19 @@ class AddedBody(Modifier):
     name: ClassVar[str] = "payload"
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        for place, (mass, x, y, z, ball) in zip(self.places, self.loads, strict=True):
+        for place, (mass, *where, _) in zip(self.places, self.loads, strict=True):
             if mass > 0:
-                body = spec.body(place).add_body(name=f"payload_{place}", pos=[x, y, z])
+                body = spec.body(place).add_body(name=f"payload_{place}", pos=list(where))
                 body.explicitinertial = True
-                body.ipos, body.inertia = [0.0, 0.0, 0.0], [ball, ball, ball]
+                body.ipos, body.inertia = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
 
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         # not in the spec: what the compiler derives from masses, such as dampings, is that of the bare robot
-        for place, (mass, *_) in zip(self.places, self.loads, strict=True):
+        for place, (mass, *_, inertia) in zip(self.places, self.loads, strict=True):
             if mass > 0:
-                rig.array("body_mass")[:, rig.model.body(f"payload_{place}").id] = mass
+                body = rig.model.body(f"payload_{place}").id
+                rig.array("body_mass")[:, body] = mass
+                rig.array("body_inertia")[:, body] = inertia
 
 
 def _payload(modifier: Modifier, values: FloatArray, _: Numerics, later: tuple[Modifier, ...]) -> Found:
