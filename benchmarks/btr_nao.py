@@ -72,11 +72,11 @@ class Plan:
 
     iterations: int = 5
     trials: int = 4
-    memory: int = 8
+    memory: int = 4
     distance: str = "likelihood"
     choice: str = "fittest"
     models: str = "lsq"
-    controllers: str = "ga"
+    controllers: str = "cmaes"
     generations: int = 11
 
     @property

@@ -252,6 +252,7 @@ def test_a_fit_goes_on_when_a_worker_dies(pool: DaskExecutor) -> None:
 
 def test_others_stand_in_for_a_worker_that_does_not_come_back(pool: DaskExecutor, tmp_path: Path) -> None:
     pool._client.wait_for_workers(2)
+    pool.late.clear()
     whole = problem(pool)
     rows = candidates(whole, 4)
     (tmp_path / "victim").write_text(repr(rows[0][0]))
@@ -263,6 +264,20 @@ def test_others_stand_in_for_a_worker_that_does_not_come_back(pool: DaskExecutor
         before = pool.shares.get(late)
         assert np.array_equal(whole.loss(rows), found)
         assert pool.shares.get(late) == before
+    finally:
+        (tmp_path / "go").touch()
+        pool.late.clear()
+
+
+def test_who_was_late_once_stands_in_for_the_last_one(pool: DaskExecutor, tmp_path: Path) -> None:
+    pool._client.wait_for_workers(2)
+    pool.late.add(next(iter(pool.threads())))
+    whole = problem(pool)
+    rows = candidates(whole, 4)
+    (tmp_path / "victim").write_text(repr(rows[0][0]))
+    try:
+        found = pool.run(partial(stall_once, tmp_path), whole, rows)
+        assert np.array_equal(found, problem().loss(rows))
     finally:
         (tmp_path / "go").touch()
         pool.late.clear()

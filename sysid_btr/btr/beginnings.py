@@ -30,17 +30,19 @@ class Beginnings:
     Attributes
     ----------
     data : the trials.
+    share : of a whole trial that is simulated.
     """
 
     data: ReplayProblem
+    share: float = 1.0
 
     @property
     def names(self) -> tuple[str, ...]:
         return self.data.names
 
     @property
-    def runs(self) -> int:
-        return len(self.data.episodes)
+    def runs(self) -> float:
+        return self.share * len(self.data.episodes)
 
     @property
     def lower(self) -> FloatArray:
@@ -72,9 +74,9 @@ class Beginnings:
         return np.asarray(np.sum(self.residuals(candidates) ** 2, axis=1))
 
 
-def beginnings(study: Study, modifiers: Sequence[Modifier], start: FloatArray) -> Beginnings:
+def beginnings(study: Study, modifiers: Sequence[Modifier], start: FloatArray, share: float = 1.0) -> Beginnings:
     """The fitted trials of a study, as a problem that begins with a model (p,) and is biased by it."""
-    return Beginnings(study.train_problem(modifiers, start))
+    return Beginnings(study.train_problem(modifiers, start), share)
 
 
 def model_fit() -> Chain:

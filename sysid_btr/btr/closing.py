@@ -45,7 +45,7 @@ class Joined:
     ----------
     message : in words.
     modifiers, values : the model with the effects; empty where none was named.
-    simulations : of trials, that it took.
+    simulations : of beginnings of trials, that it took.
     """
 
     message: str

@@ -26,7 +26,7 @@ from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
 from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
-from sysid_btr.btr.study import early_logs, trial_study
+from sysid_btr.btr.study import early, early_logs, trial_study
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
@@ -186,7 +186,7 @@ class BackToReality:
     reason : why it ended, a sentence.
     finished : whether it ended because the requirement was met or the iterations done.
     settings, seed : as given.
-    simulations : evaluations of Steps 1 and 3.
+    simulations : of whole trials, in Steps 1 and 3 and where effects were looked for.
     seconds : wall time of this run.
     """
 
@@ -286,6 +286,11 @@ class _Loop:
 
     def _stage(self, modifiers: tuple[Modifier, ...]) -> Stage:
         return Stage(make_world(self.model, self.task, modifiers, threads=self.threads), self.task, self.space)
+
+    @property
+    def _beginning(self) -> float:
+        """What of a trial its beginning is."""
+        return len(early(self.stage)) / len(self.task.time)
 
     def _fingerprint(self) -> str:
         """Digest of all that decides which simulations are run; not of how long the loop goes on."""
@@ -392,7 +397,7 @@ class _Loop:
             if not logs:
                 return None
             study = trial_study(self.stage, logs, (), self.threads)
-            asked = beginnings(study, self.stage.world.modifiers, problem.start)
+            asked = beginnings(study, self.stage.world.modifiers, problem.start, self._beginning)
         found, journal = self._search(number, step, self.settings.models, asked)
         if not np.isfinite(found.loss):
             return None
@@ -417,7 +422,7 @@ class _Loop:
         found = estimator.fit(problem, rng=rng, budget=Budget(), journal=journal, progress=noted)
         if found.termination is Termination.INTERRUPTED:
             raise InterruptedRun(f"interrupted in iteration {number}, {step}; what is done is kept")
-        self.simulations += found.evaluations * problem.runs
+        self.simulations += round(found.evaluations * problem.runs)
         return found, journal
 
     def _stuck(self, problem: ModelProblem, journal: Journal) -> bool:
@@ -437,7 +442,7 @@ class _Loop:
         kept = None if self.folder is None else self.folder / "closings" / f"{number:02d}.json"
         noted = _noted(self.progress, f"iteration {number}, closing")
         joined: Joined = join_effects(self.stage, values, self.book.made, kept, self.threads, noted)
-        self.simulations += joined.simulations
+        self.simulations += round(self._beginning * joined.simulations)
         if joined.modifiers:
             self.modifiers = joined.modifiers
             self.stage = self._stage(self.modifiers)

@@ -68,8 +68,8 @@ class SearchProblem(Problem, Protocol):
     """A problem of Step 1 or 3."""
 
     @property
-    def runs(self) -> int:
-        """Simulations that one candidate takes."""
+    def runs(self) -> float:
+        """Whole trials that are simulated for one candidate."""
         ...
 
 
@@ -90,7 +90,7 @@ class ControllerProblem:
     correction: Callable[[FloatArray], FloatArray] | None = None
 
     @property
-    def runs(self) -> int:
+    def runs(self) -> float:
         return 1
 
     @property
@@ -136,7 +136,7 @@ class ModelProblem:
         return tuple(p.name for p in self.stage.parameters)
 
     @property
-    def runs(self) -> int:
+    def runs(self) -> float:
         return len(self.trials)
 
     @cached_property

@@ -90,7 +90,7 @@ class DaskExecutor:
     Attributes
     ----------
     shares : worker -> what it has done.
-    late : workers that others had to stand in for; they are given nothing more.
+    late : workers that others had to stand in for; they are given nothing more as long as there are others.
     """
 
     def __init__(self, client: Any, *, patience: float) -> None:
@@ -139,6 +139,13 @@ class DaskExecutor:
                     f"dask worker {self._address} --nworkers auto --nthreads 1"
                 )
             time.sleep(TICK)
+
+    def caught_up(self, busy: Mapping[str, Sequence[str]]) -> list[str]:
+        """Workers that were late and have nothing to do now; they are late no more."""
+        found = [worker for worker in self.ask(self._client.scheduler.ncores) if worker in self.late]
+        found = [worker for worker in found if not busy.get(worker)]
+        self.late.difference_update(found)
+        return found
 
     def ask(self, question: Callable[..., Any], *given: Any) -> Any:
         """An answer of the scheduler.
@@ -327,7 +334,7 @@ class _Batch:
             return
         self.last = time.monotonic()
         busy: Mapping[str, Sequence[str]] = self.pool.ask(self.pool._client.scheduler.processing)
-        idle = [worker for worker in self.threads if not busy.get(worker)]
+        idle = [worker for worker in self.threads if not busy.get(worker)] or self.pool.caught_up(busy)
         if not idle:
             return
         self.pool.forget()  # who is late may be the one that holds the data
