@@ -498,6 +498,16 @@ def test_soft_stops_do_not_depend_on_the_step() -> None:
     assert errors[0] < 1e-3
 
 
+@pytest.mark.parametrize("integrator", ["RK4", "implicitfast", "Euler"])
+@pytest.mark.parametrize("joint", LEG_JOINTS)
+def test_a_gear_without_play_is_rigid_and_stable(joint: str, integrator: str) -> None:
+    log, numerics = swing(LEG_JOINTS), Numerics(integrator, 0.005)
+    effect = Backlash.at((joint,), dict.fromkeys(LEG_JOINTS, SCALE))
+    moved, plain = position(leg(), log, [effect], [0.0, 0.0], numerics), position(leg(), log, (), (), numerics)
+    assert np.abs(moved - plain).max() < 0.02 * np.ptp(plain)
+    assert np.isfinite(position(leg(), log, [effect], [0.03, 0.004], numerics)).all()
+
+
 @pytest.mark.parametrize("effect", [Backlash, BacklashMotor])
 def test_within_its_play_the_link_swings_freely(effect: type[Effect]) -> None:
     """Around the vertical the weight keeps the link still while the housing moves over the dead zone."""

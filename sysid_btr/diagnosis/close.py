@@ -465,7 +465,7 @@ def _thin(
 
 def _settled(hypothesis: Hypothesis, other: Hypothesis, fitted: Fitted) -> bool:
     """Whether another one explains all there is and this one, which is no simpler, promises much less."""
-    enough = SETTLED if hypothesis.size >= other.size else HOPELESS
+    enough = SETTLED if hypothesis.complexity >= other.complexity else HOPELESS
     return _at_floor(fitted) and hypothesis.gain < enough * other.gain
 
 
@@ -504,11 +504,11 @@ def _choose(
     near = [(h, f) for h, f in sound if f.misfit <= best + SIMPLER]
     named = {h.effect.name for h, _ in near}
     near = [(h, f) for h, f in near if not named & set(h.effect.yields_to)]
-    simplest = min(near, key=lambda t: (t[0].size, t[1].misfit))
+    simplest = min(near, key=lambda t: (t[0].complexity, t[1].misfit))
     # what is no refinement of the simplest one may still beat it beyond chance
     others = [(h, f) for h, f in near if _another(h, simplest[0]) and f.misfit < simplest[1].misfit]
     beyond = [(h, f) for h, f in others if paired_t(f, simplest[1]) > STEP_T]
-    return min(beyond or [simplest], key=lambda t: (t[0].size, t[1].misfit))
+    return min(beyond or [simplest], key=lambda t: (t[0].complexity, t[1].misfit))
 
 
 def _choose_once(
@@ -520,7 +520,7 @@ def _choose_once(
         return None
     best = min(f.misfit_everywhere for _, f in whole)
     near = [(h, f) for h, f in whole if f.misfit_everywhere <= best + SIMPLER]
-    return min(near, key=lambda t: (t[0].size, t[1].misfit_everywhere))
+    return min(near, key=lambda t: (t[0].complexity, t[1].misfit_everywhere))
 
 
 def _another(hypothesis: Hypothesis, simple: Hypothesis) -> bool:

@@ -46,6 +46,12 @@ class Hypothesis:
         """Number of parameters."""
         return len(self.start)
 
+    @property
+    def complexity(self) -> int:
+        """Number of parameters but for those that such an effect never goes without."""
+        kinds = len(self.effect.kinds)
+        return self.size // kinds * (kinds - len(self.effect.details))
+
     def ladder(self) -> FloatArray:
         """Amounts (k, parameters) that a refit may begin from, those of the scan first."""
         kinds = len(self.effect.kinds)

@@ -47,6 +47,7 @@ class Backlash(Effect):
         Kind("softness", "rad/Nm", 0.0, 0.0, 0.02, 0.0005),
     )
     held: ClassVar[tuple[str, ...]] = ("softness",)
+    details: ClassVar[tuple[str, ...]] = held
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("joint_compliance", "loads of several sizes"),
         ("coulomb_friction", "reversals under a load that does not change sign"),
@@ -72,15 +73,18 @@ class Backlash(Effect):
     def write_fields(self, rig: Rig, values: FloatArray) -> None:
         """Stops as MuJoCo's soft limits: of stiffness k / R, where R = (1 - d) / d times the joint's mobility.
 
-        k is the largest with which any integrator is stable, and the impedance d follows. What the limit adds to
-        the inertia vanishes with the square of the step.
+        k is the largest that the integrator bears, and the impedance d follows. What the limit adds to the inertia
+        vanishes with the square of the step.
         """
+        import mujoco
+
         ids = np.array([rig.model.joint(name + LINK_SUFFIX).id for name in self.places])
         half = np.maximum(values[:, :, 0] / 2, HELD)
         ranges = rig.array("jnt_range")
         ranges[:, ids, 0], ranges[:, ids, 1] = -half, half
         mobility = rig.model.dof_invweight0[rig.model.jnt_dofadr[ids]]
-        rate = 1 / rig.timestep**2
+        steps = 1.0 if rig.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 2.0
+        rate = 1 / (steps * rig.timestep) ** 2
         impedance = np.minimum(1 / (1 + rate * values[:, :, 1] / mobility), RIGID)
         solref, solimp = rig.array("jnt_solref"), rig.array("jnt_solimp")
         solref[:, ids, 0], solref[:, ids, 1] = -rate * impedance, -2 * np.sqrt(rate * impedance)

@@ -46,6 +46,7 @@ class Effect(Modifier):
     includes : simpler effects that are special cases of this one.
     yields_to : effects that are named instead of this one where a log cannot tell them apart.
     held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
+    details : kinds that such an effect never goes without, so that having them makes it no less simple.
     """
 
     title: ClassVar[str] = ""
@@ -57,6 +58,7 @@ class Effect(Modifier):
     structural: ClassVar[bool] = False
     main: ClassVar[int] = 0
     held: ClassVar[tuple[str, ...]] = ()
+    details: ClassVar[tuple[str, ...]] = ()
     steps: ClassVar[tuple[float, ...]] = (2.0,)
     everywhere: ClassVar[bool] = False
     passing: ClassVar[bool] = False

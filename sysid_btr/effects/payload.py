@@ -42,6 +42,7 @@ class Payload(Effect):
         *(Kind(axis, "m", 0.0, -0.3, 0.3, 0.02) for axis in "xyz"),
         Kind("inertia", "kg m^2", 0.0, 0.0, 0.01, 2e-5),
     )
+    details: ClassVar[tuple[str, ...]] = ("inertia",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("mass", "nothing, where the load sits at the body's centre of mass"),
         ("com_offset", "a free base, or fast motion"),
