@@ -12,7 +12,7 @@ import pytest
 
 from sysid_btr.btr.beginnings import beginnings, model_fit
 from sysid_btr.btr.choice import Pool, disagreement, fittest, pool_of
-from sysid_btr.btr.closing import join_effects
+from sysid_btr.btr.closing import _tell_apart, join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
@@ -29,6 +29,7 @@ from sysid_btr.effects.base import Effect
 from sysid_btr.effects.command_delay import CommandDelay
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators import CmaEs, GeneticAlgorithm, Record
+from sysid_btr.identify.refit import judge
 from sysid_btr.identify.study import nominal_start
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
@@ -515,6 +516,29 @@ def test_effects_are_found_in_trials_of_a_robot_that_stands_on_its_own() -> None
     assert abs(joined.values[-1] - 0.03) < 0.002
     assert np.all(np.abs(joined.values[:2] - TRUTH) < np.abs(1 - TRUTH))
     assert joined.simulations > 10
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_an_effect_has_amounts_of_its_own_where_held_out_trials_want_that(apart: bool) -> None:
+    places = tuple(SPACE.joints)
+    delays = np.where([apart and j.startswith("R") for j in places], 0.04, 0.02)
+    world = make_world(MODEL, TASK, (*modifiers(), CommandDelay(places=places)), threads=1)
+    late = HiddenRobot(world, np.array([*TRUTH, *delays]), TASK, SPACE, Noise())
+    logs = [late.run(Controller(c)).log for c in 0.4 * some_controllers(4)]
+    assert all(log is not None for log in logs)
+    study = trial_study(stage(), [log for log in logs[:2] if log], [log for log in logs[2:] if log], 1)
+    shared = CommandDelay(places=places, shared=True)
+    lengths = [(m, (float(v),)) for m, v in zip(modifiers(), TRUTH, strict=True)]
+    alike = [*lengths, (shared, (float(delays.mean()),))]
+    left = judge(study, (*modifiers(), shared), np.array([*TRUTH, delays.mean()])).holdout
+    found, holdout, spent = _tell_apart(study, alike, len(lengths), left)
+    assert spent > 1
+    assert found[-1][0].shared is not apart
+    if apart:
+        assert holdout < 0.2 * left
+        assert np.abs(np.array(found[-1][1]) - delays).max() < 0.005
+    else:
+        assert (holdout, found) == (left, alike)
 
 
 def params_entry(found: Sequence[Modifier], values: np.ndarray) -> dict[str, object]:

@@ -147,11 +147,7 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
     model = [*((m, fitted.get(id(m), v)) for m, v in declared), *joining]
     modifiers = tuple(m for m, _ in model)
     numbers = np.array([x for _, v in model for x in v])
-    told = "; ".join(
-        f"{m.name} at {len(m.places)} places: "
-        + _amounts(m, v)
-        for m, v in joining
-    )
+    told = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining)
     return {
         "message": f"joined the model: {told}; {_score(first, last)}",
         "simulations": spent,
