@@ -448,8 +448,8 @@ def test_a_sagging_supply_weakens_the_servo_with_time() -> None:
 
 def test_a_soft_supply_weakens_the_servo_with_its_own_load() -> None:
     def balance(q: float) -> float:
-        torque = KP * (COMMAND - q)
-        return torque * (1 - 0.3 * abs(torque)) - gravity(q)
+        asked, flowing = KP * (COMMAND - q), gravity(q)
+        return asked * (1 - 0.3 * abs(flowing)) - flowing
 
     q = rest(VoltageSagLoad, [0.3])
     assert balance(q) == pytest.approx(0, abs=1e-8)

@@ -37,7 +37,10 @@ class VoltageSag(Effect):
 
 @dataclass(frozen=True)
 class VoltageSagLoad(VoltageSag):
-    """Law: gain = 1 - ratio * sum of all servo torques; a supply with inner resistance."""
+    """Law: gain = 1 - ratio * sum of all servo torques; a supply with inner resistance.
+
+    The torques are those that flow, which the gain has weakened already: gain = 1 / (1 + ratio * those asked for).
+    """
 
     title: ClassVar[str] = "loss of supply voltage per unit of total torque"
     variant: ClassVar[str] = "load"
@@ -54,4 +57,4 @@ class VoltageSagLoad(VoltageSag):
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         total = np.abs(step.torque).sum(axis=1, keepdims=True)
-        step.gain *= np.clip(1 - values[:, 0, :1] * total, 0.05, 1.0)
+        step.gain /= 1 + values[:, 0, :1] * total
