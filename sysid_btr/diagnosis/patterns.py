@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 
 GROW = 1.25
 """Ratio of neighbouring pulse lengths that are tried."""
@@ -224,12 +224,13 @@ def predicted_share(signal: FloatArray, design: FloatArray, block: int) -> float
     return 1 - left / total if total > 0 else 0.0
 
 
-def without(signal: FloatArray, design: FloatArray) -> FloatArray:
-    """What a linear model and a constant leave of a signal, or of signals (n, k)."""
+def without(signal: FloatArray, design: FloatArray, told_by: BoolArray | None = None) -> FloatArray:
+    """What a linear model and a constant leave of a signal, or of signals (n, k); some samples (n,) tell the model."""
+    rows = slice(None) if told_by is None else told_by
     x = np.column_stack([np.ones(len(design)), design])
     size = np.linalg.norm(x, axis=0)
     x = x / np.where(size > 0, size, 1.0)
-    return np.asarray(signal - x @ np.linalg.lstsq(x, signal, rcond=1e-8)[0])
+    return np.asarray(signal - x @ np.linalg.lstsq(x[rows], signal[rows], rcond=1e-8)[0])
 
 
 def line_shares(signal: FloatArray, sines: Sequence[FloatArray], design: FloatArray) -> FloatArray:

@@ -166,11 +166,19 @@ def spatial_lines(one: MissingTorque) -> list[Line]:
 
 def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
     """Start (s since the first sample) and duration of the clearest pulse, or None."""
-    rest = without(one.torque, _of_motion(one))
-    box = patterns.best_box(rest, max(round(SHORTEST_PULSE / one.period), 2))
+    motion, shortest = _of_motion(one), max(round(SHORTEST_PULSE / one.period), 2)
+    rest = without(one.torque, motion)
+    box = patterns.best_box(rest, shortest)
     if box is None:
         return None
+    # what the motion explains is told by the rest of the log, else it takes a part of the pulse
     outside = np.ones(len(rest), dtype=bool)
+    outside[box.start : box.stop] = False
+    rest = without(one.torque, motion, told_by=outside)
+    box = patterns.best_box(rest, shortest)
+    if box is None:
+        return None
+    outside[:] = True
     outside[box.start : box.stop] = False
     others = rest[outside] - np.median(rest[outside])
     noise = max(1.4826 * float(np.median(np.abs(others))), one.noise)
