@@ -650,6 +650,11 @@ def test_parameter_files_that_do_not_fit_are_refused(own: Path, out: Folder) -> 
     path = out.write("params.json", json.dumps(content, default=list))
     with pytest.raises(UsageError, match=r"(?s)no servo elbow.*no body elbow"):
         read_params(path, load_robot(str(own)))
+    content = params_of(model_of(study_of(load_robot(str(own))), (effect(Backlash, "knee"),), [0.02, 0.001]))
+    del content["modifiers"][0]["parameters"][1]
+    older = out.write("older.json", json.dumps(content, default=list))
+    with pytest.raises(UsageError, match=r"backlash at knee: 1 numbers.*2 \(play, softness each\).*another version"):
+        read_params(older, load_robot(str(own)))
     with pytest.raises(UsageError, match="is not JSON"):
         read_params(out.write("params.json", "{"), load_robot(str(own)))
     with pytest.raises(UsageError, match="no parameter file"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,8 +113,15 @@ def _modifier(
         problems.append(f"{name}: the model has no {found.scope} {', '.join(unknown)}")
         return None
     known = tuple(_parameter(p) for p in entry["parameters"])
-    modifier: Modifier = found(places=where, shared=bool(entry["shared"]), known=known)
-    return modifier
+    bare: Modifier = found(places=where, shared=bool(entry["shared"]))
+    if len(known) != len(bare.parameters):
+        kinds = ", ".join(k.name for k in bare.kinds)
+        problems.append(
+            f"{name} at {', '.join(where)}: {len(known)} numbers, where this version has {len(bare.parameters)} "
+            f"({kinds} each); another version wrote the file, identify again with this one"
+        )
+        return None
+    return replace(bare, known=known)
 
 
 def _parameter(entry: Mapping[str, Any]) -> Parameter:
