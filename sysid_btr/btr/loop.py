@@ -401,9 +401,10 @@ class _Loop:
         found, journal = self._search(number, step, self.settings.models, asked)
         if not np.isfinite(found.loss):
             return None
-        foreseen = replace(problem, distance=FITNESS).loss(np.stack([problem.start, found.x]))
-        if problem.distance == LIKELIHOOD and not foreseen[1] <= SPOILT * foreseen[0]:
-            return problem.start, journal  # what comes later in the trials tells against it
+        if problem.distance == LIKELIHOOD:
+            last, new = replace(problem, distance=FITNESS).loss(np.stack([problem.start, found.x]))
+            if not np.isfinite(new) or new > SPOILT * last:
+                return problem.start, journal  # what comes later in the trials tells against it
         self.values = found.x
         candidates, losses = _all_of(journal)
         order = np.argsort(losses, kind="stable")
