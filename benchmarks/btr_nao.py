@@ -28,7 +28,13 @@ from benchmarks.paper_nao import V32
 from sysid_btr.btr.beginnings import model_fit
 from sysid_btr.btr.choice import get_choice, pool_of
 from sysid_btr.btr.controllers import Controller, NaoGait
-from sysid_btr.btr.loop import BackToReality, Settings, controller_search, first_controller_search
+from sysid_btr.btr.loop import (
+    BackToReality,
+    Settings,
+    cma_controller_searches,
+    controller_search,
+    first_controller_search,
+)
 from sysid_btr.btr.problems import ControllerProblem, Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise
 from sysid_btr.btr.task import Walk
@@ -53,10 +59,7 @@ CONTROLLERS: Mapping[str, Callable[[int], tuple[Estimator, Estimator]]] = {
         replace(first_controller_search(), generations=generations),
         replace(controller_search(len(NaoGait().names)), generations=generations),
     ),
-    "cmaes": lambda generations: (
-        CmaEs(sigma=0.3, population=20, max_generations=generations),
-        CmaEs(sigma=0.1, population=20, max_generations=generations),
-    ),
+    "cmaes": cma_controller_searches,
 }
 """Step 1 in the first iteration and in the others, by its generations of 20."""
 MODELS: Mapping[str, Estimator] = {

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid_btr.btr.beginnings import beginnings, model_fit
+from sysid_btr.btr.beginnings import Beginnings, model_fit
 from sysid_btr.btr.choice import Pool, disagreement, fittest, pool_of
 from sysid_btr.btr.closing import _tell_apart, join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
@@ -345,7 +345,7 @@ def test_what_trials_do_not_tell_stays_as_it_was() -> None:
     unseen = parse_parameters(["damping:LFCoxa"], MODEL)[0]
     free = (*modifiers(), replace(unseen, places=("LFCoxa",)))
     start = np.array([1.1, 0.9, nominal_start(free)[2]])
-    problem = beginnings(trial_study(stage(), [log], [], 1), free, start)
+    problem = Beginnings(trial_study(stage(), [log], [], 1).train_problem(free, start))
     candidates = np.vstack([start, start + problem.width])
     residuals = problem.residuals(candidates)
     np.testing.assert_allclose(residuals[:, -3:], [[0, 0, 0], [1, 1, 1]], atol=1e-12)

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -250,13 +251,23 @@ def test_a_fit_goes_on_when_a_worker_dies(pool: DaskExecutor) -> None:
     assert_same(run_fit(study(pool), progress=kill_one), fit_here())
 
 
-def test_others_stand_in_for_a_worker_that_does_not_come_back(pool: DaskExecutor, tmp_path: Path) -> None:
+@contextmanager
+def one_stalls(pool: DaskExecutor, folder: Path) -> Iterator[tuple[ReplayProblem, FloatArray]]:
+    """A problem and candidates of which `stall_once` holds one up, until the context ends."""
     pool._client.wait_for_workers(2)
     pool.late.clear()
     whole = problem(pool)
     rows = candidates(whole, 4)
-    (tmp_path / "victim").write_text(repr(rows[0][0]))
+    (folder / "victim").write_text(repr(rows[0][0]))
     try:
+        yield whole, rows
+    finally:
+        (folder / "go").touch()
+        pool.late.clear()
+
+
+def test_others_stand_in_for_a_worker_that_does_not_come_back(pool: DaskExecutor, tmp_path: Path) -> None:
+    with one_stalls(pool, tmp_path) as (whole, rows):
         found = pool.run(partial(stall_once, tmp_path), whole, rows)
         assert np.array_equal(found, problem().loss(rows))
         assert (tmp_path / "stalled").exists()
@@ -264,23 +275,13 @@ def test_others_stand_in_for_a_worker_that_does_not_come_back(pool: DaskExecutor
         before = pool.shares.get(late)
         assert np.array_equal(whole.loss(rows), found)
         assert pool.shares.get(late) == before
-    finally:
-        (tmp_path / "go").touch()
-        pool.late.clear()
 
 
 def test_who_was_late_once_stands_in_for_the_last_one(pool: DaskExecutor, tmp_path: Path) -> None:
-    pool._client.wait_for_workers(2)
-    pool.late.add(next(iter(pool.threads())))
-    whole = problem(pool)
-    rows = candidates(whole, 4)
-    (tmp_path / "victim").write_text(repr(rows[0][0]))
-    try:
+    with one_stalls(pool, tmp_path) as (whole, rows):
+        pool.late.add(next(iter(pool.threads())))
         found = pool.run(partial(stall_once, tmp_path), whole, rows)
         assert np.array_equal(found, problem().loss(rows))
-    finally:
-        (tmp_path / "go").touch()
-        pool.late.clear()
 
 
 def test_an_error_of_the_work_is_told_as_it_is(pool: DaskExecutor) -> None:

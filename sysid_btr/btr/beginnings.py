@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,8 +10,6 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.study import Study
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem
 
 PULL = 0.3
@@ -29,7 +26,7 @@ class Beginnings:
 
     Attributes
     ----------
-    data : the trials.
+    data : the fitted trials of a study; it begins at the last model.
     share : of a whole trial that is simulated.
     """
 
@@ -72,11 +69,6 @@ class Beginnings:
     def loss(self, candidates: FloatArray) -> FloatArray:
         """Sum of squared residuals (m,); NaN where a candidate diverged."""
         return np.asarray(np.sum(self.residuals(candidates) ** 2, axis=1))
-
-
-def beginnings(study: Study, modifiers: Sequence[Modifier], start: FloatArray, share: float = 1.0) -> Beginnings:
-    """The fitted trials of a study, as a problem that begins with a model (p,) and is biased by it."""
-    return Beginnings(study.train_problem(modifiers, start), share)
 
 
 def model_fit() -> Chain:

@@ -165,7 +165,7 @@ def _tell_apart(
     `found` are modifiers and values, the declared ones first; `left` is the mean squared held-out error so far.
     Returned with that of the model, and the candidates that it took.
     """
-    from sysid_btr.btr.beginnings import beginnings, model_fit
+    from sysid_btr.btr.beginnings import Beginnings, model_fit
     from sysid_btr.identify.refit import judge
 
     spent = 0
@@ -176,7 +176,7 @@ def _tell_apart(
         own = _own_amounts(effect)
         trying = [*found[:i], (own, values * len(effect.places)), *found[i + 1 :]]
         modifiers = tuple(m for m, _ in trying)
-        problem = beginnings(study, modifiers, np.array([x for _, v in trying for x in v]))
+        problem = Beginnings(study.train_problem(modifiers, np.array([x for _, v in trying for x in v])))
         estimate = model_fit().fit(
             problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
         )

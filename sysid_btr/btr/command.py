@@ -54,8 +54,14 @@ class Asked:
     def settings(self, space: ControllerSpace) -> Settings:
         """How the loop searches."""
         from sysid_btr.btr.beginnings import model_fit
-        from sysid_btr.btr.loop import LIKELIHOOD, Settings, controller_search, model_search, papers_model_search
-        from sysid_btr.estimators.cma_es import CmaEs
+        from sysid_btr.btr.loop import (
+            LIKELIHOOD,
+            Settings,
+            cma_controller_searches,
+            controller_search,
+            model_search,
+            papers_model_search,
+        )
 
         models: dict[str, Estimator] = {"cmaes": model_search(), "ga": papers_model_search(), "lsq": model_fit()}
         by_distance = "lsq" if self.distance == LIKELIHOOD else "cmaes"
@@ -77,11 +83,8 @@ class Asked:
             close=self.close,
         )
         if self.search == "cmaes":
-            settings = replace(
-                settings,
-                first=CmaEs(sigma=0.3, population=20, max_generations=11),
-                controllers=CmaEs(sigma=0.1, population=20, max_generations=11),
-            )
+            first, controllers = cma_controller_searches()
+            settings = replace(settings, first=first, controllers=controllers)
         return settings
 
     def robot(self, task: Walk, space: ControllerSpace) -> Robot:

@@ -18,7 +18,7 @@ import numpy as np
 
 from sysid_btr import __version__
 from sysid_btr._typing import FloatArray
-from sysid_btr.btr.beginnings import Beginnings, beginnings
+from sysid_btr.btr.beginnings import Beginnings
 from sysid_btr.btr.choice import Pool, get_choice, pool_of
 from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
 from sysid_btr.btr.controllers import ControllerSpace
@@ -49,7 +49,7 @@ STUCK = 0.9
 """What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
 
 STEPS = {"controllers": 1, "models": 3, "models_again": 4}
-"""Searches of an iteration by the paper's numbers; after effects joined the model least squares goes on with it."""
+"""Searches of an iteration by the paper's numbers; with a likelihood Step 3 goes on where effects joined the model."""
 LIKELIHOOD = "likelihood"
 """The distance by which Step 3 explains the first seconds of trials, and is biased by the last model."""
 SPOILT = 1.5
@@ -74,6 +74,12 @@ def controller_search(numbers: int = 36) -> GeneticAlgorithm:
 def first_controller_search() -> GeneticAlgorithm:
     """Step 1 of the first iteration: far from the controller known beforehand, which may not move at all."""
     return GeneticAlgorithm(population=20, generations=11, bits=BITS)
+
+
+def cma_controller_searches(generations: int = 11) -> tuple[CmaEs, CmaEs]:
+    """Step 1 by CMA-ES, in the first iteration and in the others: as many controllers, found by other steps."""
+    far = CmaEs(sigma=0.3, population=20, max_generations=generations)
+    return far, replace(far, sigma=0.1)
 
 
 def model_search() -> CmaEs:
@@ -397,7 +403,7 @@ class _Loop:
             if not logs:
                 return None
             study = trial_study(self.stage, logs, (), self.threads)
-            asked = beginnings(study, self.stage.world.modifiers, problem.start, self._beginning)
+            asked = Beginnings(study.train_problem(self.stage.world.modifiers, problem.start), self._beginning)
         found, journal = self._search(number, step, self.settings.models, asked)
         if not np.isfinite(found.loss):
             return None

@@ -30,6 +30,11 @@ class Box:
     height: float
     share: float
 
+    def outside(self, count: int) -> BoolArray:
+        """Which of so many samples are not in the pulse, (count,)."""
+        rows = np.arange(count)
+        return np.asarray((rows < self.start) | (rows >= self.stop))
+
 
 @dataclass(frozen=True)
 class Train:

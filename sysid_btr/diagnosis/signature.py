@@ -167,19 +167,15 @@ def spatial_lines(one: MissingTorque) -> list[Line]:
 def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
     """Start (s since the first sample) and duration of the clearest pulse, or None."""
     motion, shortest = _of_motion(one), max(round(SHORTEST_PULSE / one.period), 2)
-    rest = without(one.torque, motion)
-    box = patterns.best_box(rest, shortest)
-    if box is None:
+    first = patterns.best_box(without(one.torque, motion), shortest)
+    if first is None:
         return None
     # what the motion explains is told by the rest of the log, else it takes a part of the pulse
-    outside = np.ones(len(rest), dtype=bool)
-    outside[box.start : box.stop] = False
-    rest = without(one.torque, motion, told_by=outside)
+    rest = without(one.torque, motion, told_by=first.outside(len(motion)))
     box = patterns.best_box(rest, shortest)
     if box is None:
         return None
-    outside[:] = True
-    outside[box.start : box.stop] = False
+    outside = box.outside(len(rest))
     others = rest[outside] - np.median(rest[outside])
     noise = max(1.4826 * float(np.median(np.abs(others))), one.noise)
     length = box.stop - box.start

@@ -38,7 +38,6 @@ class Effect(Modifier):
     needs : sensors without which it cannot be seen.
     variant : tells apart two realisations under one name; empty for most.
     signed : whether its amounts may have either sign.
-    structural : whether it adds joints to the model, which then has to be compiled for its places.
     main : kind whose value says how large the effect is.
     steps : amounts the scan tries, in units of the kind's scale; more than one where the response bends.
     everywhere : whether it may well be alike at all places, so that the scan asks for that too.
@@ -55,7 +54,6 @@ class Effect(Modifier):
     needs: ClassVar[str] = "position"
     variant: ClassVar[str] = ""
     signed: ClassVar[bool] = False
-    structural: ClassVar[bool] = False
     main: ClassVar[int] = 0
     held: ClassVar[tuple[str, ...]] = ()
     details: ClassVar[tuple[str, ...]] = ()

@@ -102,16 +102,17 @@ def refit(
         tolerance=1e-6 if polish else 2e-4,
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
+    structural = any(m.structural for m in modifiers)
     if study.free:
         estimator = walking(estimator)
-    elif any(getattr(m, "structural", False) for m in modifiers):
+    elif structural:
         step = study.stencil(modifiers)
         estimator = replace(estimator, forward_step=step, central_step=step)
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
     # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
-    costly = any(type(m).overrides("law") or getattr(m, "structural", False) for m in modifiers)
+    costly = structural or any(type(m).overrides("law") for m in modifiers)
     cheaper = study.free or not (polish or costly)
     if cheaper and study.numerics != study.cheap:
         result = deferred_fit(

@@ -171,7 +171,7 @@ class Study:
         """Finite-difference step, fraction of a parameter's range: wide where impacts roughen the objective."""
         if self.free:
             return WIDE_STEP
-        return ROUGH_STEP if any(getattr(m, "structural", False) for m in modifiers) else LeastSquares.central_step
+        return ROUGH_STEP if any(m.structural for m in modifiers) else LeastSquares.central_step
 
     def settled(
         self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True, anew: bool = True

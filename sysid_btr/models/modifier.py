@@ -170,6 +170,8 @@ class Modifier:
     label: ClassVar[str] = ""
     """In the names of its parameters, where the name alone would not tell it from another one beside it."""
     kinds: ClassVar[tuple[Kind, ...]] = ()
+    structural: ClassVar[bool] = False
+    """Whether it adds joints to the model, which then has to be compiled for its places."""
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
     """What the law may change beside the joint torque: gain and motor torque, friction, limits."""
 
