@@ -1,7 +1,8 @@
 """`python -m benchmarks.close_time`: how long `close` takes on 40 s of 22 joints, by threads and by workers.
 
-Logs come from another rigid-body engine (`benchmarks.recorder`): one with an effect, one without. Rows are kept as
-they come, so that they can be measured one at a time; `--again` measures those anew that are there.
+Logs come from another rigid-body engine (`benchmarks.recorder`): one with an effect, one without, and four of 10 s with
+the effect. Rows are kept as they come, so that they can be measured one at a time; `--again` measures those anew that
+are there.
 """
 
 from __future__ import annotations
@@ -34,15 +35,17 @@ from sysid_btr.result import make_result
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.cluster.worker import Done
-    from sysid_btr.replay.executor import Work
+    from sysid_btr.replay.executor import Divide, Work
 
 MODEL = ROOT / "sample_logs" / "nao.xml"
 CLEAN = Recording(
     robot=MODEL, motion="multisine", seed=5, seconds=40.0, mass={"RKneePitch": 1.2, "LHipPitch": 0.85}, kp=0.92
 )
-CASES = {
-    "effect": replace(CLEAN, seed=6, effects=(CoulombFriction(where=("LKneePitch", "RKneePitch"), torque=0.25),)),
-    "clean": CLEAN,
+RUBBING = replace(CLEAN, seed=6, effects=(CoulombFriction(where=("LKneePitch", "RKneePitch"), torque=0.25),))
+CASES: dict[str, tuple[Recording, ...]] = {
+    "effect": (RUBBING,),
+    "clean": (CLEAN,),
+    "four logs": tuple(replace(RUBBING, seed=seed, seconds=10.0) for seed in range(6, 10)),
 }
 PLACES = ("1 thread", "2 threads", "1 worker", "2 workers")
 TARGET = 1.7
@@ -96,9 +99,9 @@ class Watched(DaskExecutor):
         self.batches = 0
         self._batch: Counter[str] = Counter()
 
-    def run(self, work: Work, problem: Any, candidates: FloatArray) -> FloatArray:
+    def run(self, work: Work, problem: Any, candidates: FloatArray, divide: Divide | None = None) -> FloatArray:
         self._batch.clear()
-        result = super().run(work, problem, candidates)
+        result = super().run(work, problem, candidates, divide)
         if self._batch:
             self.batches += 1
             self.total += sum(self._batch.values())
@@ -113,11 +116,12 @@ class Watched(DaskExecutor):
 def measure(case: str, place: str) -> dict[str, Any]:
     """`close` on one log in one place."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{case}.parquet"
-        save(CASES[case], path)
+        paths = [Path(folder) / f"{i}.parquet" for i in range(len(CASES[case]))]
+        for path, recording in zip(paths, CASES[case], strict=True):
+            save(recording, path)
         workers = int(place.partition(" ")[0])
         if "thread" in place:
-            return _close(path, IN_PROCESS, workers)
+            return _close(paths, IN_PROCESS, workers)
         import distributed
 
         cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0")
@@ -125,7 +129,7 @@ def measure(case: str, place: str) -> dict[str, Any]:
             executor = Watched(client)
             executor.threads()
             started = sum(client.run(process_time).values())
-            row = _close(path, executor)
+            row = _close(paths, executor)
             pieces = executor.total
             longest = executor.longest + row["main_thread_cpu_s"]
             return row | {
@@ -138,18 +142,19 @@ def measure(case: str, place: str) -> dict[str, Any]:
             }
 
 
-def _close(path: Path, executor: Executor, threads: int = 1) -> dict[str, Any]:
-    log = read_log(path)
+def _close(paths: Sequence[Path], executor: Executor, threads: int = 1) -> dict[str, Any]:
+    logs = [read_log(path) for path in paths]
     wall, cpu, main_thread = perf_counter(), process_time(), thread_time()
     with physics_clock() as physics:
-        study = make_study(load_robot(str(MODEL)), [log], threads=threads, executor=executor)
+        study = make_study(load_robot(str(MODEL)), logs, threads=threads, executor=executor)
         closing = close(study, list(DECLARED))
     wall, cpu, main_thread = perf_counter() - wall, process_time() - cpu, thread_time() - main_thread
     result = make_result(closing)
     return {
-        "seconds_of_log": round(float(log.time[-1] - log.time[0]), 2),
-        "samples": len(log),
-        "joints": len(log.joints("position")),
+        "logs": len(logs),
+        "seconds_of_log": round(sum(float(log.time[-1] - log.time[0]) for log in logs), 2),
+        "samples": sum(map(len, logs)),
+        "joints": len(logs[0].joints("position")),
         "numerics": str(closing.study.numerics),
         "verdict": result["verdict"],
         "effects": [f"{e['effect']}:{','.join(e['where'])}" for e in result["effects"]],
@@ -199,7 +204,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             name = f"{case}, {place}"
             if name in rows and not options.again:
                 continue
-            rows[name] = {**measure(case, place), "seed": CASES[case].seed, "machine": machine()}
+            rows[name] = {**measure(case, place), "seeds": [r.seed for r in CASES[case]], "machine": machine()}
             content = {"rows": rows, "two_workers_over_one": ratios(rows), "seconds_on_two_threads": on_threads(rows)}
             path.write_text(json.dumps(content, indent=1) + "\n")
             print(name, json.dumps(rows[name]), file=sys.stderr, flush=True)

@@ -39,7 +39,7 @@ from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.distance import DistanceProblem, MeanSquare, Phi1, Phi2, Wasserstein
 from sysid_btr.objectives.marginal import Projection
-from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.replay.engine import Numerics
 from sysid_btr.replay.executor import HERE, Executor
 
@@ -111,13 +111,74 @@ def test_whitening_does_not_depend_on_the_candidates_beside() -> None:
         assert np.array_equal(projection.whiten(part[first : first + 5]), whole[first : first + 5])
 
 
+def undivided(most: int) -> list[tuple[Any, float]]:
+    return [("whole", 1.0)]
+
+
 @given(st.integers(1, 3000), st.integers(1, 200))
 def test_pieces_cover_a_batch_once_and_keep_every_thread_busy(count: int, threads: int) -> None:
-    pieces = cut(count, threads)
+    pieces = [rows for _, rows in cut(undivided, count, threads)]
     assert [i for piece in pieces for i in range(count)[piece]] == list(range(count))
     sizes = [piece.stop - piece.start for piece in pieces]
     assert max(sizes) - min(sizes) <= 1
     assert len(pieces) >= min(count, threads)
+
+
+@given(st.integers(1, 200), st.integers(1, 16), st.lists(st.integers(1, 50), min_size=1, max_size=40))
+def test_logs_are_shared_out_where_candidates_are_few(count: int, threads: int, lengths: list[int]) -> None:
+    def divide(most: int) -> list[tuple[Any, float]]:
+        parts = [list(part) for part in np.array_split(lengths, min(most, len(lengths)))]
+        return [(tuple(part), sum(part) / sum(lengths)) for part in parts]
+
+    pieces = cut(divide, count, threads)
+    for part in dict.fromkeys(part for part, _ in pieces):
+        rows = [i for own, piece in pieces if own == part for i in range(count)[piece]]
+        assert rows[: rows.index(count - 1) + 1] == list(range(count))
+    assert len(pieces) >= min(threads, count * min(threads, len(lengths)))
+
+
+@pytest.mark.parametrize("effect", ["", "coulomb_friction", "stribeck_friction"])
+def test_a_problem_in_parts_gives_side_by_side_what_the_whole_gives(effect: str) -> None:
+    whole = problem(HERE, *([effect] if effect else []), logs=3)
+    rows = candidates(whole, 3)
+    for most in (1, 2, 3, 7):
+        divided = whole.divided(most)
+        assert len(divided) == min(most, 3)
+        assert sum(share for _, share in divided) == pytest.approx(1.0)
+        assert whole.divided(most) is divided
+        beside = np.concatenate([part.residuals(rows) for part, _ in divided], axis=1)
+        assert np.array_equal(beside, whole.residuals(rows))
+        errors = np.concatenate([part.errors(rows[0]) for part, _ in divided])
+        assert np.array_equal(errors, whole.errors(rows[0]))
+
+
+@pytest.mark.parametrize("logs", [1, 2])
+def test_one_replay_gives_what_is_fitted_and_what_is_held_out(logs: int) -> None:
+    own = study(logs=logs)
+    modifiers = own.declare(FREE)
+    fitted, heldout = own.train_problem(modifiers), own.holdout_problem(modifiers)
+    values = candidates(fitted, 1)
+    asked: list[ReplayProblem] = []
+
+    def look(at: ReplayProblem) -> FloatArray:
+        asked.append(at)
+        return np.asarray(at.residuals(values)[0])
+
+    found = of_both(fitted, heldout, look)
+    assert len(asked) == 1
+    assert np.array_equal(found[0], fitted.residuals(values)[0])
+    assert np.array_equal(found[1], heldout.residuals(values)[0])
+
+
+def test_another_log_that_is_held_out_is_replayed_by_itself() -> None:
+    other = replace(leg_log(), channels={n: c + 1e-3 for n, c in leg_log().channels.items()})
+    own = make_study(toys.leg(), [leg_log()], holdout=[other], numerics=QUICK, threads=1)
+    modifiers = own.declare(FREE)
+    fitted, heldout = own.train_problem(modifiers), own.holdout_problem(modifiers)
+    values = candidates(fitted, 1)
+    found = of_both(fitted, heldout, lambda at: np.asarray(at.residuals(values)[0]))
+    assert np.array_equal(found[0], fitted.residuals(values)[0])
+    assert np.array_equal(found[1], heldout.residuals(values)[0])
 
 
 def test_a_problem_travels_without_what_made_its_model() -> None:
@@ -173,8 +234,19 @@ def test_a_cluster_gives_what_one_machine_gives(pool: DaskExecutor) -> None:
     assert np.array_equal(there.loss(rows), here.loss(rows))
     distance = Wasserstein()
     assert np.array_equal(DistanceProblem(there, distance).loss(rows), DistanceProblem(here, distance).loss(rows))
-    assert sum(share.candidates for share in pool.shares.values()) == 3 * len(rows)
+    # residuals and losses of either log, distances of both at once
+    assert sum(share.candidates for share in pool.shares.values()) == 5 * len(rows)
     assert len(pool.shares) == 2
+
+
+def test_one_candidate_of_two_logs_is_shared_out(pool: DaskExecutor) -> None:
+    there, here = problem(pool, logs=2), problem(HERE, logs=2)
+    before = sum(share.pieces for share in pool.shares.values())
+    row = candidates(here, 1)
+    assert np.array_equal(there.residuals(row), here.residuals(row))
+    assert np.array_equal(there.errors(row[0]), here.errors(row[0]))
+    assert there.loss(row)[0] == here.loss(row)[0]
+    assert sum(share.pieces for share in pool.shares.values()) - before >= 6
 
 
 def test_logs_and_model_are_sent_once(pool: DaskExecutor) -> None:
@@ -198,7 +270,7 @@ def noted(folder: Path, of: ReplayProblem, rows: FloatArray) -> FloatArray:
     for row in rows:
         with (folder / f"{row[0]!r}").open("a") as file:
             file.write(f"{os.getpid()}\n")
-    return of._loss(rows)
+    return np.asarray(of._losses(rows).sum(axis=1))
 
 
 def die_once(folder: Path, of: ReplayProblem, rows: FloatArray) -> FloatArray:
@@ -217,7 +289,7 @@ def stall_once(folder: Path, of: ReplayProblem, rows: FloatArray) -> FloatArray:
         (folder / "stalled").touch()
         while folder.exists() and not (folder / "go").exists():
             time.sleep(0.05)
-    return of._loss(rows)
+    return np.asarray(of._losses(rows).sum(axis=1))
 
 
 def marks(folder: Path, rows: FloatArray) -> list[int]:
@@ -232,7 +304,7 @@ def test_a_worker_that_dies_costs_its_share_only(pool: DaskExecutor, tmp_path: P
     found = pool.run(partial(die_once, tmp_path), whole, rows)
     assert np.array_equal(found, problem().loss(rows))
     assert (tmp_path / "dead").exists()
-    pieces = cut(len(rows), 2)
+    pieces = [piece for _, piece in cut(undivided, len(rows), 2)]
     begun = [set(marks(tmp_path, rows[piece])) for piece in pieces]
     assert begun[-1] == {2}  # what it had begun
     assert all(len(count) == 1 for count in begun)

@@ -134,6 +134,34 @@ def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:
     assert found.signature is not None
 
 
+@pytest.mark.parametrize(
+    ("motion", "effect", "seed", "imitators"),
+    [
+        (
+            "gait",
+            "cable_coupling:HipRoll,KneePitch:stiffness=1.9",
+            5,
+            ("joint_spring", "encoder_offset", "encoder_scale", "com_offset", "payload", "constant_force"),
+        ),
+        ("gait", "controller_dropout:HipPitch:start=1.8,duration=0.07,every=2.1", 5, ("all",)),
+        ("poses", "controller_dropout:AnkleRoll:start=1.8,duration=0.12,every=2", 6, ("all",)),
+    ],
+)
+def test_what_others_can_only_imitate_is_not_given_their_name(
+    motion: Any, effect: str, seed: int, imitators: tuple[str, ...]
+) -> None:
+    """A gait repeats itself, so that a spring may stand for a cable, and a push for a servo that lets go."""
+    pytest.importorskip("pinocchio", reason="the recorder needs Pinocchio (pip install pin)")
+    from benchmarks.recorder import Recording, parse_effect, record
+
+    model = str(SAMPLES / "leg.xml")
+    recording = Recording(model, motion=motion, seed=seed, seconds=12, effects=(parse_effect(effect),))
+    study = make_study(load_robot(model), [record(recording)[0]])
+    found = close(study, ["mass:*Knee*", "kp:*=shared"], effects=imitators)
+    assert found.verdict == "unexplained", found.message
+    assert found.effects == ()
+
+
 def test_a_weak_motor_is_found() -> None:
     found, planted = sample("pendulum_weak"), truth("pendulum_weak")
     effect = only_effect(found)

@@ -359,6 +359,22 @@ def test_masses_on_a_walk_lie_within_their_intervals() -> None:
         assert low <= HEAVY[estimate.name] <= high, estimate
 
 
+def test_a_robot_that_walks_and_hangs_is_known_better_than_from_either_log() -> None:
+    walked = record_walk(Gait(), 8.0, edit=heavier("LKneePitch", 1.4))[0]
+    held = replace(walked, meta=replace(walked.meta, mount="fixed"))
+    run = replay_log(load_robot("nao"), held, {"mass:LKneePitch": 1.4}, numerics=Numerics("RK4", 0.0025))
+    rng = np.random.default_rng(2)
+    seen = {n: c + rng.normal(scale=4e-4, size=len(c)) for n, c in run.channels.items() if n.startswith("position")}
+    hanging = replace(held, channels={n: c for n, c in held.channels.items() if n.startswith("command")} | seen)
+    free = ["mass:LKneePitch,RKneePitch", "kp:*=shared"]
+    alone = fit(make_study(load_robot("nao"), [hanging], threads=2), free)
+    both = fit(make_study(load_robot("nao"), [hanging, walked], threads=2), free)
+    for estimate, hung, walking in zip(both.estimates, alone.estimates, heavy_fit().estimates, strict=True):
+        assert abs(estimate.value - HEAVY[estimate.name]) < 3 * estimate.std, estimate
+        # a standard error is itself known to a few percent
+        assert estimate.std < 1.05 * min(hung.std, walking.std), (hung, walking)
+
+
 def test_the_stride_is_the_time_after_which_the_commands_of_a_walk_repeat() -> None:
     for period in (0.8, 1.0, 1.3):
         time = np.arange(0.0, 12.0, 0.02)

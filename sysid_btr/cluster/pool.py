@@ -22,7 +22,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.cluster.wire import Parcel, pack
 from sysid_btr.cluster.worker import Done, keep, simulate, versions
 from sysid_btr.errors import LostCluster, ModelError
-from sysid_btr.replay.executor import Work
+from sysid_btr.replay.executor import Divide, Work
 
 TICK = 0.5
 """s between looks at what has become of the cluster."""
@@ -38,6 +38,8 @@ PIECES = 4
 """Pieces for each thread of the cluster, at most: small ones even out workers of different speed."""
 PIECE = 16
 """Candidates below which a thread's share is not cut further: together they share the cost of a Python step."""
+EVEN = 1.1
+"""Largest part of a problem, over the mean one, up to which they are even enough to be given out whole."""
 HELD = 512 * 2**20
 """Bytes of problems that the cluster is left with; more, and it forgets all of them."""
 
@@ -103,17 +105,19 @@ class DaskExecutor:
         self._parcels: WeakKeyDictionary[Any, tuple[str, tuple[str, ...]]] = WeakKeyDictionary()
         self._held = _Held()
 
-    def run(self, work: Work, problem: Any, candidates: FloatArray) -> FloatArray:
-        """See `Executor`. One candidate is simulated here: it would only travel.
+    def run(self, work: Work, problem: Any, candidates: FloatArray, divide: Divide | None = None) -> FloatArray:
+        """See `Executor`. One candidate of one log is simulated here: it would only travel.
 
         Raises
         ------
         LostCluster
             If scheduler or workers stay away.
         """
-        if len(candidates) < 2 or self._client.status in ("closing", "closed"):
+        divide = divide or (lambda most: [(problem, 1.0)])
+        alone = len(candidates) < 2 and len(divide(2)) < 2
+        if alone or self._client.status in ("closing", "closed"):
             return work(problem, candidates)
-        return _Batch(self, work, problem, candidates).run()
+        return _Batch(self, work, divide, candidates).run()
 
     def threads(self) -> Mapping[str, int]:
         """Workers that are not late, and their threads; waits a while for the first one.
@@ -229,10 +233,11 @@ class DaskExecutor:
 class _Batch:
     """One batch on its way."""
 
-    def __init__(self, pool: DaskExecutor, work: Work, problem: Any, candidates: FloatArray) -> None:
-        self.pool, self.work, self.problem, self.candidates = pool, work, problem, candidates
+    def __init__(self, pool: DaskExecutor, work: Work, divide: Divide, candidates: FloatArray) -> None:
+        self.pool, self.work, self.divide, self.candidates = pool, work, divide, candidates
         self.name = f"sysid-btr-{uuid.uuid4().hex}"
-        self.pieces: list[slice] = []
+        self.pieces: list[tuple[Any, slice]] = []
+        """Part of the problem, and rows of the candidates, part by part."""
         self.done: dict[int, FloatArray] = {}
         self.waiting: dict[Any, int] = {}
         self.threads: Mapping[str, int] = {}
@@ -255,13 +260,17 @@ class _Batch:
         finally:
             if self.waiting:
                 self.drop(list(self.waiting))
-        return np.concatenate([self.done[i] for i in range(len(self.pieces))])
+        beside: dict[int, list[FloatArray]] = {}
+        for i, (part, _) in enumerate(self.pieces):
+            beside.setdefault(id(part), []).append(self.done[i])
+        columns = [np.concatenate(rows) for rows in beside.values()]
+        return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=1)
 
     def begin(self) -> None:
         """Give out every piece that is not done."""
         self.threads = self.pool.threads()
         if not self.pieces:
-            self.pieces = cut(len(self.candidates), sum(self.threads.values()))
+            self.pieces = cut(self.divide, len(self.candidates), sum(self.threads.values()))
         for i in range(len(self.pieces)):
             if i not in self.done:
                 self.give(i, list(self.threads) if self.pool.late else None)
@@ -269,9 +278,10 @@ class _Batch:
 
     def give(self, i: int, workers: Sequence[str] | None) -> None:
         """Let one of some workers do a piece, or any."""
-        key, packs = self.pool.send(self.problem, workers)
+        part, which = self.pieces[i]
+        key, packs = self.pool.send(part, workers)
         self.sent += 1
-        rows = self.candidates[self.pieces[i]]
+        rows = self.candidates[which]
         future = self.pool.submit(self.work, key, packs, rows, key=f"{self.name}-{i}-{self.sent}", workers=workers)
         self.waiting[future] = i
 
@@ -350,8 +360,17 @@ class _Batch:
             self.pool._client.cancel(futures, asynchronous=False)
 
 
-def cut(count: int, threads: int) -> list[slice]:
-    """Pieces of a batch for a number of threads."""
-    each = max(1, min(PIECES, count // (threads * PIECE)))
-    borders = np.linspace(0, count, min(count, threads * each) + 1).round().astype(int)
-    return [slice(int(a), int(b)) for a, b in pairwise(borders)]
+def cut(divide: Divide, count: int, threads: int) -> list[tuple[Any, slice]]:
+    """Pieces of a batch for a number of threads: parts of its problem, and rows of its candidates.
+
+    Few candidates are kept together, and the logs that they are to explain are shared out.
+    """
+    many = count >= threads * PIECE
+    parts = divide(1 if many else threads)
+    if len(parts) == 1:
+        each = max(1, min(PIECES, count // (threads * PIECE))) * threads
+    else:
+        even = max(share for _, share in parts) * len(parts) <= EVEN and threads % len(parts) == 0
+        each = -(-threads // len(parts)) * (1 if even else 2)
+    borders = np.linspace(0, count, min(count, each) + 1).round().astype(int)
+    return [(part, slice(int(a), int(b))) for part, _ in parts for a, b in pairwise(borders)]

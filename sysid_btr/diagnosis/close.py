@@ -26,7 +26,7 @@ from sysid_btr.effects.library import select_effects
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift, walking_error
+from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift, weigh_walks
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.refit import (
     Fitted,
@@ -97,8 +97,10 @@ STEP_CERTAIN = 0.3
 WHOLE_EXCESS, WHOLE_LEFT, WHOLE_HARM = 2.0, 0.03, 0.01
 """Excess of a column's chi2 on fitted data of which an effect must leave less than this fraction, without harm to
 held-out data, to be added although these do not show it."""
-EXPLAINED = 0.85
-"""Fraction of the held-out excess that must be gone for effects to be named."""
+EXPLAINED, EXPLAINED_WALKING = 0.975, 0.85
+"""Fraction of the excess, held out and fitted, that must be gone for effects to be named. On 148 logs of another engine
+the right ones left up to 1.3 % (2.3 % where one of two was missed), and what imitated another effect 2.9 % or more. Of
+walks the ground leaves more."""
 AT_FLOOR = 1.10
 """Held-out chi2 up to which a log shows nothing more: noise floors are known to a few percent."""
 FLOOR_ALL, FLOOR_COLUMN = 1.03, 1.12
@@ -239,7 +241,7 @@ def close(
             steps.append(StepRecord((), _named_only_in(state, real), real.fitted.train, real.fitted.holdout))
             final_estimates, study, state = _estimates(study, real)
     count = sum(len(m.parameters) for m in declared)
-    verdict = _verdict(before, state)
+    verdict = _verdict(study, before, state)
     later = later_split(study, state.fitted, _column_limit(state.fitted)) if verdict == "unexplained" else None
     if later is not None:
         # what is missing shows only after the fitted part: fit more of the log, hold out what is left
@@ -266,7 +268,7 @@ def close(
     return Closing(
         study=study,
         verdict=verdict,
-        message=message_of(verdict, kept, first.before, after, left, unit),
+        message=message_of(verdict, named, first.before, after, left, unit),
         noise_floor={c: s.floor for c, s in first.before.holdout.items()},
         nominal=first.nominal,
         before=first.before,
@@ -689,7 +691,10 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
             residual = problem.residuals(fitted.values[None])[0]
         shift = numerics_shift(problem, fitted.values, jacobian, residual)
         if study.free:
-            shift = np.hypot(shift, walking_error(study, problem, fitted.values, jacobian, residual))
+            weighed = weigh_walks(study, problem, fitted.values, jacobian, residual)
+            jacobian, residual = weighed.jacobian, weighed.residual
+            shift = np.hypot(shift, weighed.error)
+            fitted = replace(fitted, values=weighed.values)
         found = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift)
         bare = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks)
         told = np.array([e.identifiable != "no" for e in bare])
@@ -758,12 +763,15 @@ def _named_only_in(before: _State, after: _State) -> tuple[str, ...]:
     return tuple(f"{e.name} at {', '.join(places)}" for e, places in gone if places)
 
 
-def _verdict(before: Fitted, state: _State) -> Verdict:
+def _verdict(study: Study, before: Fitted, state: _State) -> Verdict:
     at_floor = AT_FLOOR + CHANCE * before.overall_chance
+    now, least = state.fitted, EXPLAINED_WALKING if study.free else EXPLAINED
     if not state.effects:
-        return "nothing_missing" if max(before.holdout, before.train) <= at_floor else "unexplained"
-    if _gain(before, state.fitted) < EXPLAINED and state.fitted.holdout > at_floor:
-        return "unexplained"
+        return "nothing_missing" if max(now.holdout, now.train) <= at_floor else "unexplained"
+    # what happens in the fitted part alone must be explained there
+    for first, last in ((before.holdout, now.holdout), (before.train, now.train)):
+        if last - at_floor > (1 - least) * (first - 1):
+            return "unexplained"
     return "ambiguous" if any(state.rivals) else "explained"
 
 

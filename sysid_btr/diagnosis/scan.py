@@ -226,34 +226,41 @@ def _ask(
                 rows = rows_of.get(_limb(asked[i], where), everywhere)
                 finite = np.isfinite(change).all()
                 responses[i, d] = change[rows] if finite else None
+    least = NO_RESPONSE * float(rest @ rest) / len(rest)
+    parts = {limb: _Part(rows, basis[rows], rest[rows]) for limb, rows in rows_of.items()}
+    whole = _Part(everywhere, basis, rest)
     traces = []
     for i, question in enumerate(asked):
-        rows = rows_of.get(_limb(question, where), everywhere)
         columns = [responses[i, d] for d in range(len(question.probe))]
         known = [c for c in columns if c is not None]
         if len(known) < len(columns):
             continue
-        trace = _judge(question, rows, np.column_stack(known), rest, basis, scales)
+        part = parts.get(_limb(question, where), whole)
+        trace = _judge(question, part, np.column_stack(known), least, scales)
         if trace is not None:
             traces.append(trace)
     return traces
 
 
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The residuals of a limb, or all: their rows (n,), the basis there (n, k), and what is to be explained (n,)."""
+
+    rows: IntArray
+    basis: FloatArray
+    rest: FloatArray
+
+
 def _judge(
-    question: Question,
-    rows: IntArray,
-    response: FloatArray,
-    rest: FloatArray,
-    basis: FloatArray,
-    scales: Scales,
+    question: Question, part: _Part, response: FloatArray, least: float, scales: Scales
 ) -> Trace | None:
-    """How much of the residual legal multiples of a response explain."""
-    projected = response - basis[rows] @ (basis[rows].T @ response)
-    # projecting off shared parameters leaks to other limbs; that part is counted, not stored
-    coefficients = basis[rows].T @ response
+    """How much of the residual legal multiples of a response explain; None of one below `least`, squared."""
+    coefficients = part.basis.T @ response
+    projected = response - part.basis @ coefficients
     gram = response.T @ response - coefficients.T @ coefficients
-    inner = projected.T @ rest[rows] - _leak(basis, rows, coefficients, rest)
-    if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= NO_RESPONSE * float(rest @ rest) / len(rest):
+    # the residual is off the basis, so that what the projection takes, here and from other limbs, has no part in this
+    inner = response.T @ part.rest
+    if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= least:
         return None
     # the residual is measured minus predicted, so a response that explains it has the opposite sign
     amounts = _legal(question.effect, gram, -inner)
@@ -261,14 +268,7 @@ def _judge(
     values = question.effect.combine(scale_at(scales, question.place), question.probe, amounts)
     if values is None or gain <= 0:
         return None
-    return Trace(question, rows, projected, amounts, gain, values)
-
-
-def _leak(basis: FloatArray, rows: IntArray, coefficients: FloatArray, rest: FloatArray) -> FloatArray:
-    """Inner product with the residual of what the projection puts into other rows; rest is off the basis."""
-    outside = -(basis[rows].T @ rest[rows])
-    result: FloatArray = coefficients.T @ outside
-    return result
+    return Trace(question, part.rows, projected, amounts, gain, values)
 
 
 def _legal(effect: type[Effect], gram: FloatArray, target: FloatArray) -> FloatArray:

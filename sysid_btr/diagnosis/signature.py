@@ -88,7 +88,9 @@ def proposals(
         scale, place = study.scales[one.joint], (one.joint,)
         if Cogging in wanted:
             asked += [Question(Cogging, place, Cogging.probe_at(scale, x.number)) for x in spatial_lines(one)]
-        if ExternalDisturbance in wanted and (push := single_pulse(one)) is not None:
+        push = single_pulse(one) if ExternalDisturbance in wanted else None
+        # pulses of a train that differ are no pushes that come again: what they follow is something else
+        if push is not None and not _within_train(problem, values, one.joint, *push):
             asked.append(Question(ExternalDisturbance, place, ExternalDisturbance.probe_at(scale, *push)))
         train = pulse_train(one)
         if train is None:
@@ -102,6 +104,20 @@ def proposals(
             probe = DriveDisturbanceTrain.probe_at(scale, *when)
             asked.append(Question(DriveDisturbanceTrain, place, probe))
     return asked
+
+
+def _within_train(problem: ReplayProblem, values: FloatArray, joint: str, start: float, duration: float) -> bool:
+    """Whether a pulse is at the time of one of those that the model already has at this joint."""
+    column = 0
+    for modifier in problem.modifiers:
+        own = values[None, column : column + len(modifier.parameters)]
+        column += len(modifier.parameters)
+        if isinstance(modifier, ExternalDisturbanceTrain) and joint in modifier.places:
+            _, first, long, period = modifier.spread(own)[0, modifier.places.index(joint)]
+            # since the train's pulse that began last before this one ends
+            if (start + duration - first) % period < duration + long:
+                return True
+    return False
 
 
 def _loud(problem: ReplayProblem, residual: FloatArray) -> bool:

@@ -19,11 +19,24 @@ def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
     for i, group in enumerate(effect.groups):
         own = found[i * kinds : (i + 1) * kinds]
         amounts = ", ".join(_amount(e, k.name, kinds > 1) for e, k in zip(own, effect.kinds, strict=True))
-        place = group.replace(",", ", ")
-        if group.count(",") >= 6:
-            place = f"{group.count(',') + 1} places ({', '.join(group.split(',')[:3])}, ...)"
-        parts.append(f"{place}: {amounts}")
+        parts.append(f"{_places(group.split(','))}: {amounts}")
     return f"{effect.title}: " + "; ".join(parts)
+
+
+def _places(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) < 7 else f"{len(names)} places ({', '.join(names[:3])}, ...)"
+
+
+def _left(before: Scores, after: Scores, channel: str) -> str:
+    """How much of the error above the noise floor, squared, is left of the fitted and of the held-out part."""
+    parts = {"fitted": (before.train, after.train), "held-out": (before.holdout, after.holdout)}
+    shares = {
+        name: (new[channel].chi2 - 1) / max(old[channel].chi2 - 1, 1e-12)
+        for name, (old, new) in parts.items()
+        if channel in old and channel in new
+    }
+    percent = {name: 100 * max(share, 0.0) for name, share in shares.items()}
+    return " and ".join(f"{p:{'.0f' if p >= 1 else '.1g'}} % of the {name}" for name, p in percent.items()) + " error"
 
 
 def _amount(estimate: Estimate, kind: str, label: bool) -> str:
@@ -41,7 +54,7 @@ def message_of(
     left: Mapping[str, Any] | None,
     unit: str = "rad",
 ) -> str:
-    """The verdict in one sentence, with the held-out error before and after."""
+    """The verdict in one sentence, with the held-out error before and after; `effects` are the best there are."""
     channel = "position"
     errors = ""
     if channel in before.holdout and channel in after.holdout:
@@ -53,6 +66,9 @@ def message_of(
         return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
     if verdict == "unexplained":
         hint = "" if not left else f" What is left is {left.get('summary', 'not characterised')}."
+        if effects:
+            listing = ", ".join(f"{e.effect} at {_places(e.where)}" for e in effects)
+            hint = f" The nearest, {listing}, leaves {_left(before, after, channel)} (squared): it is not named.{hint}"
         return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
     if left:
         errors += f" Something is left that no effect accounts for: {left.get('summary', 'not characterised')}."

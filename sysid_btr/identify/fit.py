@@ -20,7 +20,7 @@ from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, estim
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
-from sysid_btr.identify.walk import repeated_error
+from sysid_btr.identify.walk import Walk, repeated_error, walked_residuals
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
@@ -57,7 +57,7 @@ class Fit:
     values : (p,) the estimates' values.
     nominal, before : scores of the plain and of the fitted model on fitted and held-out data.
     result : what the estimator returned.
-    numerics_shift : (p,) change of the estimates when the step is halved; on walks with `walking_error`.
+    numerics_shift : (p,) change of the estimates when the step is halved; on walks with the error of `weigh_walks`.
     replays : candidates simulated.
     seconds : wall time.
     profiles : likelihood along single parameters, where it was asked for (`identify.profile`).
@@ -180,7 +180,9 @@ def fit(
         replays += polished.evaluations
         values, jacobian, residual = _at_optimum(problem, polished, step)
     if study.free:
-        shift = np.hypot(shift, walking_error(study, problem, values, jacobian, residual))
+        weighed = weigh_walks(study, problem, values, jacobian, residual)
+        values, jacobian, residual = weighed.values, weighed.jacobian, weighed.residual
+        shift = np.hypot(shift, weighed.error)
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift)
     extra = 0
     if isinstance(estimator, LeastSquares):
@@ -227,7 +229,12 @@ def settled_refit(study: Study, modifiers: tuple[Modifier, ...], start: FloatArr
     study = study.settled(modifiers, coarse.values, held=False, anew=False)
     again = refit(study, modifiers, coarse.values, iterations=3)
     study = replace(study.settled(modifiers, again.values), numerics=numerics)
-    return study, judge(study, modifiers, again.values, again.evaluations + coarse.evaluations)
+    spent = again.evaluations + coarse.evaluations
+    if all(isinstance(log, Walk) for log in study.train):
+        return study, judge(study, modifiers, again.values, spent)
+    # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model
+    right = refit(study, modifiers, again.values)
+    return study, replace(right, evaluations=right.evaluations + spent)
 
 
 def contact_starts(modifiers: tuple[Modifier, ...], start: FloatArray) -> FloatArray:
@@ -271,27 +278,81 @@ def numerics_shift(
     return -np.asarray(np.linalg.lstsq(jacobian, fine - residual, rcond=1e-6)[0])
 
 
-def walking_error(
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A linearised fit of walks, and of other logs.
+
+    Attributes
+    ----------
+    values : (p,) estimates.
+    jacobian, residual : (r, p) and (r,) there; of walks among other logs as much as they are believed.
+    error : (p,) standard deviation beyond that of pieces of the log that are independent.
+    """
+
+    values: FloatArray
+    jacobian: FloatArray
+    residual: FloatArray
+    error: FloatArray
+
+
+def weigh_walks(
     study: Study, problem: ReplayProblem, values: FloatArray, jacobian: FloatArray, residual: FloatArray
-) -> FloatArray:
-    """Standard deviation of estimates from walks, (p,), beyond that of pieces of the log that are independent."""
-    placed = placement_shift(study, problem.modifiers, values)
-    return np.hypot(placed, repeated_error(problem, jacobian, residual))
+) -> Weighed:
+    """What errors that every stride repeats do to estimates; beside other logs, walks count for less by them.
+
+    Weighed by the noise of its sensors alone, a walk would draw what a hanging robot tells better towards the errors
+    of its own contact. The estimates follow by one Gauss-Newton step.
+
+    Parameters
+    ----------
+    study, problem : with at least one walk.
+    values, jacobian, residual : (p,), (r, p), (r,) at the optimum, whitened.
+    """
+    walked, moved = walked_residuals(problem), _placed_elsewhere(study, problem.modifiers, values)
+
+    def error(j: FloatArray, r: FloatArray, factor: float, step: FloatArray) -> FloatArray:
+        if moved is None:
+            return np.full(len(values), np.inf)
+        there, residual_there, walked_there = moved
+        scale = np.where(walked_there, factor, 1.0)
+        placed = _newton(there * scale[:, None], residual_there * scale) - step
+        span = problem.upper - problem.lower
+        return np.hypot(np.clip(placed, -span, span), repeated_error(problem, j, r))
+
+    found = error(jacobian, residual, 1.0, np.zeros(len(values)))
+    if walked.all() or not np.isfinite(found).all():
+        return Weighed(values, jacobian, residual, found)
+    scale = np.linalg.norm(jacobian, axis=0)
+    unit = jacobian / np.where(scale > 0, scale, 1.0)
+    inverse = np.linalg.pinv(unit.T @ unit, rcond=RANK, hermitian=True)
+    # what the noise of the walks alone does to the estimates
+    noise = np.linalg.norm(unit[walked] @ inverse, axis=0) / np.where(scale > 0, scale, 1.0)
+    told = noise > 0
+    excess = float(np.mean((found[told] / noise[told]) ** 2)) if told.any() else 0.0
+    factor = 1 / np.sqrt(1 + excess)
+    rows = np.where(walked, factor, 1.0)
+    jacobian, residual = jacobian * rows[:, None], residual * rows
+    step = np.clip(values + _newton(jacobian, residual), problem.lower, problem.upper) - values
+    residual = residual + jacobian @ step
+    return Weighed(values + step, jacobian, residual, error(jacobian, residual, factor, step))
 
 
-def placement_shift(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray) -> FloatArray:
-    """Change of the estimates, (p,), to first order, when the windows of walks begin elsewhere.
+def _newton(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    return -np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0])
 
-    In the right model this is a part of the noise; in another it is the least that the model's error does.
+
+def _placed_elsewhere(
+    study: Study, modifiers: tuple[Modifier, ...], values: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray] | None:
+    """Jacobian (r, p), residual (r,) and which of it is of walks, where windows begin elsewhere; None if that fails.
+
+    In the right model the change of the estimates is a part of the noise; in another it is the least that the model's
+    error does.
     """
     relaid = study.relaid().settled(modifiers, values, held=False)
     problem = relaid.train_problem(modifiers, values)
     residual, jacobian = linearise(corrected(problem, study.rough, values), values, step=study.stencil(modifiers))
-    if not np.isfinite(jacobian).all():
-        return np.full(len(values), np.inf)
-    span = problem.upper - problem.lower
-    change = -np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0])
-    return np.clip(change, -span, span)
+    return (jacobian, residual, walked_residuals(problem)) if np.isfinite(jacobian).all() else None
 
 
 def _at_optimum(

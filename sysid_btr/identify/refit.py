@@ -15,7 +15,7 @@ from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.study import WIDE_STEP, Study
 from sysid_btr.identify.walk import Walk
 from sysid_btr.models.modifier import Modifier
-from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.replay.engine import Numerics
 
 CORRELATED = 1.5
@@ -164,7 +164,7 @@ def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, eva
     """Scores of given values on fitted and held-out data."""
     train = study.train_problem(modifiers)
     holdout = study.holdout_problem(modifiers)
-    r, s = train.residuals(values[None])[0], holdout.residuals(values[None])[0]
+    r, s = of_both(train, holdout, lambda problem: np.asarray(problem.residuals(values[None])[0]))
     train_columns, holdout_columns = _by_column(train, r), _by_column(holdout, s)
     a, b = _counts(train), _counts(holdout)
     same = len(a) == len(b)

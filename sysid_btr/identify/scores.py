@@ -10,11 +10,11 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.models.modifier import Modifier
+from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.objectives.targets import COMPARED
 
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
-    from sysid_btr.objectives.problem import ReplayProblem
 
 
 @dataclass(frozen=True)
@@ -50,45 +50,41 @@ def score(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -> Sc
     from dataclasses import replace
 
     wide = replace(study, channels=COMPARED)
-    return Scores(
-        train=score_problem(wide.train_problem(modifiers), values),
-        holdout=score_problem(wide.holdout_problem(modifiers), values),
-    )
+    fitted, heldout = wide.train_problem(modifiers), wide.holdout_problem(modifiers)
+    errors = of_both(fitted, heldout, lambda problem: problem.errors(values))
+    return Scores(*(_scores(problem, own) for problem, own in zip((fitted, heldout), errors, strict=True)))
 
 
 def score_problem(problem: ReplayProblem, values: FloatArray) -> dict[str, ChannelScore]:
     """Scores of one candidate on one problem's episodes."""
-    squares: dict[str, dict[str, float]] = {}
-    counts: dict[str, dict[str, int]] = {}
-    signal: dict[str, float] = {}
-    chi2: dict[str, float] = {}
-    floor: dict[str, float] = {}
-    for episode in problem.episodes:
-        outputs = episode.replay.predict(values[None])
-        for target, error in zip(episode.targets, episode.errors(outputs), strict=True):
-            for k, joint in enumerate(target.joints):
-                good = target.mask[:, k]
-                channel = target.channel
-                e = error[good, k]
-                by_joint = squares.setdefault(channel, {})
-                by_joint[joint] = by_joint.get(joint, 0.0) + float(e @ e)
-                number = counts.setdefault(channel, {})
-                number[joint] = number.get(joint, 0) + len(e)
-                measured = target.measured[good, k]
-                signal[channel] = signal.get(channel, 0.0) + float(measured @ measured)
-                noise = target.noise[k]
-                chi2[channel] = chi2.get(channel, 0.0) + float(e @ e) / noise**2
-                floor[channel] = floor.get(channel, 0.0) + len(e) * noise**2
+    return _scores(problem, problem.errors(values))
+
+
+def _scores(problem: ReplayProblem, error: FloatArray) -> dict[str, ChannelScore]:
+    """Scores of errors (r,), channel by channel, over all episodes."""
+    labels, columns = problem.column_labels, problem.columns
+    measured = np.concatenate([t.measured[t.mask] for e in problem.episodes for t in e.targets])
+    count, square, signal = (
+        np.bincount(labels, weights, len(columns)) for weights in (np.ones(len(error)), error**2, measured**2)
+    )
+    noise = np.array([t.noise[k] ** 2 for _, t, k in columns])
     result = {}
-    for channel, by_joint in squares.items():
-        total, number_all = sum(by_joint.values()), sum(counts[channel].values())
-        if number_all == 0:
+    for channel in dict.fromkeys(t.channel for _, t, _ in columns):
+        own = np.array([t.channel == channel for _, t, _ in columns])
+        number = count[own].sum()
+        if number == 0:
             continue
+        total, size = float(square[own].sum()), float(signal[own].sum())
+        joints: dict[str, tuple[float, float]] = {}
+        for i in np.flatnonzero(own):
+            _, target, k = columns[i]
+            before = joints.get(target.joints[k], (0.0, 0.0))
+            joints[target.joints[k]] = before[0] + float(square[i]), before[1] + float(count[i])
         result[channel] = ChannelScore(
-            rmse=float(np.sqrt(total / number_all)),
-            nrmse=float(np.sqrt(total / signal[channel])) if signal[channel] > 0 else float("inf"),
-            chi2=chi2[channel] / number_all,
-            joints={j: float(np.sqrt(s / max(counts[channel][j], 1))) for j, s in by_joint.items()},
-            floor=float(np.sqrt(floor[channel] / number_all)),
+            rmse=float(np.sqrt(total / number)),
+            nrmse=float(np.sqrt(total / size)) if size > 0 else float("inf"),
+            chi2=float((square / noise)[own].sum() / number),
+            joints={joint: float(np.sqrt(s / max(n, 1.0))) for joint, (s, n) in joints.items()},
+            floor=float(np.sqrt((count * noise)[own].sum() / number)),
         )
     return result

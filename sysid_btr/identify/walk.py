@@ -413,11 +413,15 @@ def repeated_error(problem: ReplayProblem, jacobian: FloatArray, residual: Float
     """
     from scipy.stats import norm, t
 
+    walked = walked_residuals(problem)
+    # other logs have no such errors; what they know holds the estimates all the same
+    residual = np.where(walked, residual, 0.0)
     noise = np.diag(covariance(jacobian, residual, np.arange(len(residual)) // SHORT))
     total = np.zeros(len(noise))
     for pieces in (problem.column_labels, _phases(problem)):
-        if pieces is None or len(np.unique(pieces)) < FEWEST:
+        if pieces is None or len(np.unique(pieces[walked])) < FEWEST:
             continue
+        pieces = np.where(walked, pieces, pieces.max() + 1 + problem.blocks)
         cov, dof = spread(jacobian, residual, pieces)
         with np.errstate(invalid="ignore"):
             beyond = np.nan_to_num(np.diag(cov) - noise, posinf=0.0, neginf=0.0)
@@ -427,6 +431,13 @@ def repeated_error(problem: ReplayProblem, jacobian: FloatArray, residual: Float
 
 SHORT = 8
 """Residuals in a row that make a piece where all are taken for independent."""
+
+
+def walked_residuals(problem: ReplayProblem) -> BoolArray:
+    """(r,) whether a residual is of a walk."""
+    own = [isinstance(e.replay.log, Walk) for e in problem.episodes]
+    counts = [sum(int(t.mask.sum()) for t in e.targets) for e in problem.episodes]
+    return np.repeat(own, counts)
 
 
 def _phases(problem: ReplayProblem) -> IntArray | None:

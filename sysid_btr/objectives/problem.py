@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -131,7 +131,7 @@ class ReplayProblem:
 
     def residuals(self, candidates: FloatArray) -> FloatArray:
         """Whitened residuals, (m, r), of candidates (m, p); NaN rows where a candidate diverged."""
-        return self.executor.run(ReplayProblem._residuals, self, np.atleast_2d(candidates))
+        return self.executor.run(ReplayProblem._residuals, self, np.atleast_2d(candidates), self.divided)
 
     def _residuals(self, candidates: FloatArray) -> FloatArray:
         result = np.empty((len(candidates), self.count))
@@ -143,15 +143,53 @@ class ReplayProblem:
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         """Sum of squared whitened residuals, (m,); NaN where a candidate diverged."""
-        return self.executor.run(ReplayProblem._loss, self, np.atleast_2d(candidates))
+        candidates = np.atleast_2d(candidates)
+        return np.asarray(self.executor.run(ReplayProblem._losses, self, candidates, self.divided).sum(axis=1))
 
-    def _loss(self, candidates: FloatArray) -> FloatArray:
-        total = np.zeros(len(candidates))
+    def _losses(self, candidates: FloatArray) -> FloatArray:
+        """The same of every episode, (m, episodes)."""
+        result = np.empty((len(candidates), len(self.episodes)))
         for party in self._parties:
             for rows, outputs in self._simulate(party, candidates):
                 for i, own in zip(party, outputs, strict=True):
-                    total[rows] += np.sum(self.episodes[i].whitened(own) ** 2, axis=1)
-        return total
+                    result[rows, i] = np.sum(self.episodes[i].whitened(own) ** 2, axis=1)
+        return result
+
+    def errors(self, values: FloatArray) -> FloatArray:
+        """Errors, (r,), of one candidate (p,) in SI units, in the order of the residuals; see `Episode.errors`."""
+        return np.asarray(self.executor.run(ReplayProblem._errors, self, values[None], self.divided)[0])
+
+    def _errors(self, candidates: FloatArray) -> FloatArray:
+        result = np.empty((1, self.count))
+        for party in self._parties:
+            for _, outputs in self._simulate(party, candidates):
+                for i, own in zip(party, outputs, strict=True):
+                    episode = self.episodes[i]
+                    pairs = zip(episode.errors(own), episode.targets, strict=True)
+                    result[0, self._columns_of[i]] = np.concatenate([e[t.mask] for e, t in pairs])
+        return result
+
+    def divided(self, most: int) -> tuple[tuple[ReplayProblem, float], ...]:
+        """Problems in some of the episodes each, at most so many; what they give side by side is what this one does.
+
+        Each with its share of the simulated time. Asked for the same number again, they are the same ones.
+        """
+        if most not in self._divisions:
+            steps = np.array([e.replay.grid.steps for e in self.episodes], dtype=np.float64)
+            middle = (np.cumsum(steps) - 0.5 * steps) / steps.sum()
+            part = (middle * most).astype(np.int64)
+            self._divisions[most] = tuple(
+                (
+                    replace(self, episodes=tuple(e for e, own in zip(self.episodes, part, strict=True) if own == k)),
+                    float(steps[part == k].sum() / steps.sum()),
+                )
+                for k in np.unique(part)
+            )
+        return self._divisions[most]
+
+    @cached_property
+    def _divisions(self) -> dict[int, tuple[tuple[ReplayProblem, float], ...]]:
+        return {}
 
     @cached_property
     def _parties(self) -> list[tuple[int, ...]]:
@@ -238,6 +276,42 @@ class ReplayProblem:
         """The same problem under another integrator or step."""
         episodes = tuple(replace(e, replay=replace(e.replay, numerics=numerics)) for e in self.episodes)
         return replace(self, episodes=episodes)
+
+
+def of_both(
+    fitted: ReplayProblem, heldout: ReplayProblem, look: Callable[[ReplayProblem], FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """What is seen of two problems, (r,) each; one replay shows both where the one's logs begin the other's.
+
+    Parameters
+    ----------
+    fitted, heldout : under the same modifiers.
+    look : gives a number for every residual of a problem.
+    """
+    pairs = list(zip(fitted.episodes, heldout.episodes, strict=False))
+    if len(fitted.episodes) != len(heldout.episodes) or not all(_begins(a.replay, b.replay) for a, b in pairs):
+        return look(fitted), look(heldout)
+    joined = tuple(replace(b, targets=(*a.targets, *b.targets)) for a, b in pairs)
+    seen = look(replace(heldout, episodes=joined))
+    owner = [(b, int(t.mask.sum())) for pair in pairs for b, e in enumerate(pair) for t in e.targets]
+    second = np.repeat([b == 1 for b, _ in owner], [n for _, n in owner])
+    return seen[~second], seen[second]
+
+
+def _begins(a: Replay, b: Replay) -> bool:
+    """Whether the one replay is, to the last bit, the beginning of the other."""
+    n = len(a.log)
+    return (
+        type(a) is Replay
+        and type(b) is Replay
+        and n <= len(b.log)
+        and (a.modifiers, a.numerics, a.effort) == (b.modifiers, b.numerics, b.effort)
+        and a.log.channels.keys() == b.log.channels.keys()
+        and all(np.array_equal(v, b.log.channels[k][:n], equal_nan=True) for k, v in a.log.channels.items())
+        and np.array_equal(a.log.time, b.log.time[:n])
+        and all(np.array_equal(x, y) for x, y in zip(a.start, b.start, strict=True))
+        and np.array_equal(a.grid.command, b.grid.command[: a.grid.steps])
+    )
 
 
 @dataclass(frozen=True, eq=False)
