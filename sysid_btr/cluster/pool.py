@@ -271,8 +271,14 @@ class _Batch:
         self.threads = self.pool.threads()
         if not self.pieces:
             self.pieces = cut(self.divide, len(self.candidates), sum(self.threads.values()))
-        for i in range(len(self.pieces)):
-            if i not in self.done:
+        waiting = [i for i in range(len(self.pieces)) if i not in self.done]
+        seats = [worker for worker, n in self.threads.items() for _ in range(n)]
+        if len(waiting) <= len(seats):
+            # the scheduler would give two to the worker that has the data
+            for i, worker in zip(waiting, seats, strict=False):
+                self.give(i, [worker])
+        else:
+            for i in waiting:
                 self.give(i, list(self.threads) if self.pool.late else None)
         self.last = time.monotonic()
 

@@ -14,6 +14,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.study import WIDE_STEP, Study
 from sysid_btr.identify.walk import Walk
+from sysid_btr.io.log import Log
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.replay.engine import Numerics
@@ -295,10 +296,10 @@ def shorten(study: Study, seconds: float) -> Study:
 
     Of walks it keeps some of their windows, and a cheaper integrator.
     """
-    train = tuple(
-        log.thinned(min(seconds, MOST_WALKED))
-        if isinstance(log, Walk)
-        else log.window(0, max(int(np.searchsorted(log.time, log.time[0] + seconds)), 2))
-        for log in study.train
-    )
-    return replace(study, train=train, numerics=study.rough)
+    def begin(log: Log) -> Log:
+        if isinstance(log, Walk):
+            return log.thinned(min(seconds, MOST_WALKED))
+        stop = max(int(np.searchsorted(log.time, log.time[0] + seconds)), 2)
+        return log.once(("begin", stop), lambda: log.window(0, stop))
+
+    return replace(study, train=tuple(begin(log) for log in study.train), numerics=study.rough)

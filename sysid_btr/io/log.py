@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import difflib
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
+
+T = TypeVar("T")
 
 SCHEMA_VERSION = 1
 
@@ -194,6 +197,21 @@ class Log:
             episode=self.episode[rows],
             unknown={name: values[rows] for name, values in self.unknown.items()},
         )
+
+    def once(self, key: tuple[Any, ...], work: Callable[[], T]) -> T:
+        """What `work` finds of this log, which never changes; found once for each key and kept as long as the log."""
+        if key not in self._found:
+            self._found[key] = work()
+        found: T = self._found[key]
+        return found
+
+    @cached_property
+    def _found(self) -> dict[tuple[Any, ...], Any]:
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The log itself, without what was found of it."""
+        return {name: value for name, value in vars(self).items() if name != "_found"}
 
     def episodes(self) -> tuple[slice, ...]:
         """Row ranges of the episodes: the runs of equal episode number, in row order."""

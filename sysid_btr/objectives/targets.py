@@ -80,6 +80,12 @@ def make_targets(
     ModelError
         If the log shares no measured joint with the model.
     """
+    return log.once(("targets", joints, channels, warm_up), lambda: _make_targets(log, joints, channels, warm_up))
+
+
+def _make_targets(
+    log: Log, joints: tuple[str, ...], channels: tuple[str, ...], warm_up: float
+) -> tuple[Target, ...]:
     time = log.time - log.time[0]
     targets = []
     for channel in channels:
