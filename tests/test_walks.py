@@ -32,6 +32,7 @@ from sysid_btr.identify.walk import (
     cut_up,
     lay_windows,
     make_walk,
+    of_legs,
     repeated_error,
     start_lanes,
     stride,
@@ -357,6 +358,18 @@ def test_masses_on_a_walk_lie_within_their_intervals() -> None:
     for estimate in heavy_fit().estimates:
         low, high = estimate.ci95
         assert low <= HEAVY[estimate.name] <= high, estimate
+
+
+def test_the_ground_reaches_the_bodies_that_carry_the_base() -> None:
+    study = heavy_study()
+    masses, gains = ["mass:LKneePitch,RShoulderRoll,Torso", "mass:*HipRoll=shared"], ["kp:LKneePitch"]
+    problem = study.train_problem(study.declare([*masses, *gains, "foot_compliance:*AnkleRoll=shared"]))
+    told = dict(zip((p.name for p in problem.parameters), of_legs(problem), strict=True))
+    assert {name for name, own in told.items() if own} == {
+        "mass:LKneePitch",
+        "foot_compliance:*AnkleRoll",
+        "mass:*HipRoll",
+    }
 
 
 def test_a_robot_that_walks_and_hangs_is_known_better_than_from_either_log() -> None:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.models.modifier import Kind, Modifier, Parameter
 from sysid_btr.models.scales import JointScale, Scales
-
-if TYPE_CHECKING:
-    from sysid_btr.models.fields import Scope
 
 LADDER = (0.3, 0.55, 1.0, 1.8, 3.0, 5.0)
 """Multiples of the scan's amount at which a refit may begin."""
@@ -49,7 +46,6 @@ class Effect(Modifier):
     """
 
     title: ClassVar[str] = ""
-    scope: ClassVar[Scope] = "joint"
     confounders: ClassVar[tuple[tuple[str, str], ...]] = ()
     needs: ClassVar[str] = "position"
     variant: ClassVar[str] = ""

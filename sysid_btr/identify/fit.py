@@ -16,11 +16,11 @@ from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.deferred import corrected, deferred_fit
-from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, estimates
+from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, covariance, estimates
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
-from sysid_btr.identify.walk import Walk, repeated_error, walked_residuals
+from sysid_btr.identify.walk import GROUND, Walk, of_legs, repeated_error, walked_residuals
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
@@ -301,7 +301,7 @@ def weigh_walks(
     """What errors that every stride repeats do to estimates; beside other logs, walks count for less by them.
 
     Weighed by the noise of its sensors alone, a walk would draw what a hanging robot tells better towards the errors
-    of its own contact. The estimates follow by one Gauss-Newton step.
+    of its own contact. It counts as much as leaves the estimates most certain; they follow by one Gauss-Newton step.
 
     Parameters
     ----------
@@ -309,32 +309,43 @@ def weigh_walks(
     values, jacobian, residual : (p,), (r, p), (r,) at the optimum, whitened.
     """
     walked, moved = walked_residuals(problem), _placed_elsewhere(study, problem.modifiers, values)
+    if moved is None:
+        return Weighed(values, jacobian, residual, np.full(len(values), np.inf))
+    there, residual_there, walked_there = moved
+    beyond = np.where(of_legs(problem), GROUND**2 - 1, 0.0)
+    span = problem.upper - problem.lower
 
-    def error(j: FloatArray, r: FloatArray, factor: float, step: FloatArray) -> FloatArray:
-        if moved is None:
-            return np.full(len(values), np.inf)
-        there, residual_there, walked_there = moved
-        scale = np.where(walked_there, factor, 1.0)
-        placed = _newton(there * scale[:, None], residual_there * scale) - step
-        span = problem.upper - problem.lower
-        return np.hypot(np.clip(placed, -span, span), repeated_error(problem, j, r))
+    def weighed(weight: float) -> Weighed:
+        rows = np.where(walked, weight, 1.0)
+        j, r = jacobian * rows[:, None], residual * rows
+        step = np.zeros(len(values))
+        if weight < 1:
+            step = np.clip(_newton(j, r), problem.lower - values, problem.upper - values)
+        r = r + j @ step
+        rows = np.where(walked_there, weight, 1.0)
+        placed = np.clip(_newton(there * rows[:, None], residual_there * rows) - step, -span, span)
+        told = np.hypot(placed, repeated_error(problem, j, r))
+        # what the ground does wrong everywhere is as much again, and more
+        return Weighed(values + step, j, r, np.sqrt(told**2 + beyond * (told**2 + _noise_of(j, walked) ** 2)))
 
-    found = error(jacobian, residual, 1.0, np.zeros(len(values)))
-    if walked.all() or not np.isfinite(found).all():
-        return Weighed(values, jacobian, residual, found)
-    scale = np.linalg.norm(jacobian, axis=0)
-    unit = jacobian / np.where(scale > 0, scale, 1.0)
+    def doubt(found: Weighed) -> float:
+        std = np.sqrt(np.diag(covariance(found.jacobian, found.residual, problem.blocks)))
+        return float(np.mean(np.log(np.clip(np.hypot(std, found.error) / span, 1e-12, 1.0))))
+
+    return weighed(1.0) if walked.all() else min(map(weighed, WEIGHTS), key=doubt)
+
+
+WEIGHTS = tuple(np.geomspace(1.0, 0.01, 9).tolist())
+"""Factors by which the residuals of walks count beside those of other logs."""
+
+
+def _noise_of(jacobian: FloatArray, rows: BoolArray) -> FloatArray:
+    """Standard deviation (p,) of estimates by white noise of unit size in some rows of the residual."""
+    norm = np.linalg.norm(jacobian, axis=0)
+    norm = np.where(norm > 0, norm, 1.0)
+    unit = jacobian / norm
     inverse = np.linalg.pinv(unit.T @ unit, rcond=RANK, hermitian=True)
-    # what the noise of the walks alone does to the estimates
-    noise = np.linalg.norm(unit[walked] @ inverse, axis=0) / np.where(scale > 0, scale, 1.0)
-    told = noise > 0
-    excess = float(np.mean((found[told] / noise[told]) ** 2)) if told.any() else 0.0
-    factor = 1 / np.sqrt(1 + excess)
-    rows = np.where(walked, factor, 1.0)
-    jacobian, residual = jacobian * rows[:, None], residual * rows
-    step = np.clip(values + _newton(jacobian, residual), problem.lower, problem.upper) - values
-    residual = residual + jacobian @ step
-    return Weighed(values + step, jacobian, residual, error(jacobian, residual, factor, step))
+    return np.asarray(np.linalg.norm(unit[rows] @ inverse, axis=0) / norm)
 
 
 def _newton(jacobian: FloatArray, residual: FloatArray) -> FloatArray:

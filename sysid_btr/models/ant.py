@@ -16,8 +16,8 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.models.fields import FieldModifier, Scope, allow_any_inertia
-from sysid_btr.models.modifier import Kind, Rig
+from sysid_btr.models.fields import FieldModifier, allow_any_inertia
+from sysid_btr.models.modifier import Kind, Rig, Scope
 from sysid_btr.models.robot import Robot, robot_from_spec
 
 if TYPE_CHECKING:

@@ -11,19 +11,15 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.models.modifier import LINK_SUFFIX, Kind, Modifier, Rig
+from sysid_btr.models.modifier import LINK_SUFFIX, Kind, Modifier, Rig, Scope
 
 if TYPE_CHECKING:
     import mujoco
-
-Scope = Literal["body", "joint", "servo", "robot"]
 
 
 @dataclass(frozen=True)
 class FieldModifier(Modifier):
     """A parameter of the grammar; `scope` says which names its globs match."""
-
-    scope: ClassVar[Scope] = "joint"
 
 
 def _bodies(rig: Rig, places: tuple[str, ...]) -> list[int]:

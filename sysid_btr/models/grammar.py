@@ -10,8 +10,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sysid_btr.errors import UsageError
-from sysid_btr.models.fields import FIELDS, FieldModifier, Scope, nominal_value
-from sysid_btr.models.modifier import Parameter
+from sysid_btr.models.fields import FIELDS, FieldModifier, nominal_value
+from sysid_btr.models.modifier import Parameter, Scope
 from sysid_btr.models.robot import Robot, body_names, joint_names, servo_joints
 from sysid_btr.models.scales import SLIDE_UNITS, JointScale, Scales
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -151,6 +151,9 @@ class Outputs:
     base: FloatArray | None = None
 
 
+Scope = Literal["body", "joint", "servo", "robot"]
+
+
 @dataclass(frozen=True)
 class Modifier:
     """Base of everything that changes a model under parameters; hooks that do nothing by default.
@@ -170,6 +173,8 @@ class Modifier:
     label: ClassVar[str] = ""
     """In the names of its parameters, where the name alone would not tell it from another one beside it."""
     kinds: ClassVar[tuple[Kind, ...]] = ()
+    scope: ClassVar[Scope] = "joint"
+    """What its places are."""
     structural: ClassVar[bool] = False
     """Whether it adds joints to the model, which then has to be compiled for its places."""
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
