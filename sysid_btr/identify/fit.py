@@ -301,8 +301,7 @@ def weigh_walks(
     """What errors that every stride repeats do to estimates; beside other logs, walks count for less by them.
 
     Weighed by the noise of its sensors alone, a walk would draw what a hanging robot tells better towards the errors
-    of its own contact. It counts as much as makes the estimate that suffers most from the other logs, or from the walk,
-    most certain; they all follow by one Gauss-Newton step.
+    of its own contact. It counts as much as leaves the estimates most certain; they follow by one Gauss-Newton step.
 
     Parameters
     ----------
@@ -329,13 +328,11 @@ def weigh_walks(
         # what the ground does wrong everywhere is as much again, and more
         return Weighed(values + step, j, r, np.sqrt(told**2 + beyond * (told**2 + _noise_of(j, walked) ** 2)))
 
-    if walked.all():
-        return weighed(1.0)
-    choices = [weighed(weight) for weight in WEIGHTS]
-    inner = [np.diag(covariance(c.jacobian, c.residual, problem.blocks)) for c in choices]
-    std = np.clip(np.sqrt([v + c.error**2 for v, c in zip(inner, choices, strict=True)]) / span, 1e-12, 1.0)
-    # beside what the one or the other tells by itself, no estimate is to suffer
-    return choices[int(np.argmin(np.max(std / np.minimum(std[0], std[-1]), axis=1)))]
+    def doubt(found: Weighed) -> float:
+        std = np.sqrt(np.diag(covariance(found.jacobian, found.residual, problem.blocks)))
+        return float(np.mean(np.log(np.clip(np.hypot(std, found.error) / span, 1e-12, 1.0))))
+
+    return weighed(1.0) if walked.all() else min(map(weighed, WEIGHTS), key=doubt)
 
 
 WEIGHTS = tuple(np.geomspace(1.0, 0.01, 9).tolist())
