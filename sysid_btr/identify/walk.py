@@ -434,8 +434,10 @@ SHORT = 8
 
 
 def of_legs(problem: ReplayProblem) -> BoolArray:
-    """(p,) whether a parameter is of a body between the base and the ground, or of the ground itself."""
-    walk = next(e.replay for e in problem.episodes if isinstance(e.replay.log, Walk))
+    """(p,) whether a parameter is of a body between the base and the ground of a walk, or of the ground itself."""
+    walk = next((e.replay for e in problem.episodes if isinstance(e.replay.log, Walk)), None)
+    if walk is None:
+        return np.zeros(len(problem.parameters), dtype=bool)
     model = walk.model
     legs: set[str] = set()
     for foot in touching_bodies(model):
@@ -459,8 +461,8 @@ disagrees with what its ground does everywhere. Arms and gains need nothing: 0.6
 
 
 def walked_residuals(problem: ReplayProblem) -> BoolArray:
-    """(r,) whether a residual is of a walk."""
-    own = [isinstance(e.replay.log, Walk) for e in problem.episodes]
+    """(r,) whether a residual is of a log of a free base."""
+    own = [e.replay.log.meta.mount == "free" for e in problem.episodes]
     counts = [sum(int(t.mask.sum()) for t in e.targets) for e in problem.episodes]
     return np.repeat(own, counts)
 
