@@ -257,9 +257,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=0, help="worker threads, 0 for all cores")
     options = parser.parse_args(argv)
     first, _, last = options.walks.partition("-")
+    table = [pd.read_csv(options.out)] if options.out.exists() else []
+    done = {int(walk) for rows in table for walk in rows.walk}
     for seed in range(int(first), int(last or first) + 1):
-        table = pd.read_csv(options.out) if options.out.exists() else pd.DataFrame({"walk": []})
-        if (table.walk == seed).any():
+        if seed in done:
             continue
         walker = draw(seed)
         log = record(walker)
@@ -267,12 +268,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"walk {seed}: falls", file=sys.stderr, flush=True)
             continue
         rows = examine(walker, log, options.threads)
-        pd.concat([pd.read_csv(options.out), rows] if options.out.exists() else [rows]).to_csv(
-            options.out, index=False, float_format="%.5g"
-        )
+        table.append(rows)
+        pd.concat(table).to_csv(options.out, index=False, float_format="%.5g")
         print(f"walk {seed}: {int(rows.inside.sum())} of {len(rows)} inside", file=sys.stderr, flush=True)
-    if options.out.exists():
-        print(summary(pd.read_csv(options.out)), end="")
+    if table:
+        print(summary(pd.concat(table)), end="")
     return 0
 
 

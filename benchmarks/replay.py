@@ -243,10 +243,10 @@ def _still(replay: Replay, count: int) -> None:
     """As many steps, controls held: the solver has least to do where nothing moves."""
     import mujoco
 
-    data = _at_start(replay)
+    data, controls = _at_start(replay), _controls(replay)
     for _ in range(count):
         _at_start(replay, data)
-        data.ctrl[:] = _controls(replay)[0]
+        data.ctrl[:] = controls[0]
         mujoco.mj_step(replay.model, data, replay.grid.steps)
 
 

@@ -111,7 +111,7 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
         message = "fewer than two trials with a log of their first seconds: nothing can be looked for"
         return {"message": message, "params": None}
     declared = _split(stage.world.modifiers, values)
-    free = [m for m, _ in declared if getattr(m, "scope", "") != "body"] or [m for m, _ in declared]
+    free = [m for m, _ in declared if m.scope != "body"] or [m for m, _ in declared]
     held = tuple((m, v) for m, v in declared if m not in free)
     start = np.array([x for m, v in declared if m in free for x in v])
     effects = tuple(dict.fromkeys(e.name for e in select_effects(("all",)) if e.name not in SAME))

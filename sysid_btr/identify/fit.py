@@ -275,7 +275,7 @@ def numerics_shift(
     fine = problem.with_numerics(numerics.halved()).residuals(values[None])[0]
     if not np.isfinite(fine).all():
         return np.full(len(values), np.inf)
-    return -np.asarray(np.linalg.lstsq(jacobian, fine - residual, rcond=1e-6)[0])
+    return _newton(jacobian, fine - residual)
 
 
 @dataclass(frozen=True, eq=False)

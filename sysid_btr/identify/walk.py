@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from sysid_btr.objectives.targets import Target, make_targets
 from sysid_btr.replay.engine import Numerics, Replay, compile_model, make_index
 from sysid_btr.replay.quiet import quiet
 from sysid_btr.replay.windows import BASE, WindowReplay, Windows
+
+if TYPE_CHECKING:
+    import mujoco
 
 WINDOW = 0.2
 """s, length of a window where nothing tells a better one."""
@@ -439,16 +443,11 @@ def of_legs(problem: ReplayProblem) -> BoolArray:
     if walk is None:
         return np.zeros(len(problem.parameters), dtype=bool)
     model = walk.model
-    legs: set[str] = set()
-    for foot in touching_bodies(model):
-        body = model.body(foot.name).id
-        while body not in (base_body(model), 0):
-            legs.add(model.body(body).name)
-            body = int(model.body_parentid[body])
+    feet = [model.body(foot.name).id for foot in touching_bodies(model)]
+    legs = {model.body(b).name for foot in feet for b in _up_to_base(model, foot)} - {model.body(base_body(model)).name}
     result: list[bool] = []
     for modifier in problem.modifiers:
-        whole = [modifier.places] if len(modifier.groups) == 1 else [(place,) for place in modifier.places]
-        for places in whole:
+        for places in modifier.grouped:
             own = modifier.scope == "body" and not legs.isdisjoint(places)
             result += [own or modifier.name.startswith("foot_")] * len(modifier.kinds)
     return np.array(result)
@@ -462,9 +461,8 @@ disagrees with what its ground does everywhere. Arms and gains need nothing: 0.6
 
 def walked_residuals(problem: ReplayProblem) -> BoolArray:
     """(r,) whether a residual is of a log of a free base."""
-    own = [e.replay.log.meta.mount == "free" for e in problem.episodes]
-    counts = [sum(int(t.mask.sum()) for t in e.targets) for e in problem.episodes]
-    return np.repeat(own, counts)
+    free = [problem.episodes[i].replay.log.meta.mount == "free" for i, _, _ in problem.columns]
+    return np.array(free)[problem.column_labels]
 
 
 def _phases(problem: ReplayProblem) -> IntArray | None:
@@ -543,16 +541,10 @@ def start_lanes(replay: WindowReplay) -> list[list[tuple[int, IntArray]]]:
     model, index = replay.model, replay.index
     joints = len(index.joints)
     everything = np.arange(joints)
-    base = base_body(model)
     feet = {model.body(f.name).id for f in touching_bodies(model)}
 
-    def branch(body: int) -> int:
-        while int(model.body_parentid[body]) not in (base, 0):
-            body = int(model.body_parentid[body])
-        return body
-
-    standing = {branch(b) for b in feet}
-    own = [branch(int(b)) for b in index.body]
+    standing = {_up_to_base(model, b)[-1] for b in feet}
+    own = [_up_to_base(model, int(b))[-1] for b in index.body]
     lanes = [[(c, everything)] for c in (2, 3, 4, *range(6, BASE))]
     hanging: dict[int, list[int]] = {}
     for j, b in enumerate(own):
@@ -564,3 +556,11 @@ def start_lanes(replay: WindowReplay) -> list[list[tuple[int, IntArray]]]:
         members = [(m[k], np.array(m)) for m in hanging.values() if k < len(m)]
         lanes += [[(BASE + j, seen) for j, seen in members], [(BASE + joints + j, seen) for j, seen in members]]
     return lanes
+
+
+def _up_to_base(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and those between it and the base, outermost first."""
+    base, chain = base_body(model), [body]
+    while int(model.body_parentid[chain[-1]]) not in (base, 0):
+        chain.append(int(model.body_parentid[chain[-1]]))
+    return chain

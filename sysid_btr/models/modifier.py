@@ -183,9 +183,14 @@ class Modifier:
     @property
     def groups(self) -> tuple[str, ...]:
         """Label of each independent set of parameters."""
+        return tuple(",".join(places) for places in self.grouped)
+
+    @property
+    def grouped(self) -> tuple[tuple[str, ...], ...]:
+        """Places of each independent set of parameters."""
         if self.shared and len(self.places) > 1:
-            return (",".join(self.places),)
-        return self.places
+            return (self.places,)
+        return tuple((place,) for place in self.places)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -135,10 +135,8 @@ class ReplayProblem:
 
     def _residuals(self, candidates: FloatArray) -> FloatArray:
         result = np.empty((len(candidates), self.count))
-        for party in self._parties:
-            for rows, outputs in self._simulate(party, candidates):
-                for i, own in zip(party, outputs, strict=True):
-                    result[rows, self._columns_of[i]] = self.episodes[i].whitened(own)
+        for i, rows, outputs in self._simulated(candidates):
+            result[rows, self._columns_of[i]] = self.episodes[i].whitened(outputs)
         return result
 
     def loss(self, candidates: FloatArray) -> FloatArray:
@@ -149,10 +147,8 @@ class ReplayProblem:
     def _losses(self, candidates: FloatArray) -> FloatArray:
         """The same of every episode, (m, episodes)."""
         result = np.empty((len(candidates), len(self.episodes)))
-        for party in self._parties:
-            for rows, outputs in self._simulate(party, candidates):
-                for i, own in zip(party, outputs, strict=True):
-                    result[rows, i] = np.sum(self.episodes[i].whitened(own) ** 2, axis=1)
+        for i, rows, outputs in self._simulated(candidates):
+            result[rows, i] = np.sum(self.episodes[i].whitened(outputs) ** 2, axis=1)
         return result
 
     def errors(self, values: FloatArray) -> FloatArray:
@@ -161,12 +157,10 @@ class ReplayProblem:
 
     def _errors(self, candidates: FloatArray) -> FloatArray:
         result = np.empty((1, self.count))
-        for party in self._parties:
-            for _, outputs in self._simulate(party, candidates):
-                for i, own in zip(party, outputs, strict=True):
-                    episode = self.episodes[i]
-                    pairs = zip(episode.errors(own), episode.targets, strict=True)
-                    result[0, self._columns_of[i]] = np.concatenate([e[t.mask] for e, t in pairs])
+        for i, _, outputs in self._simulated(candidates):
+            episode = self.episodes[i]
+            pairs = zip(episode.errors(outputs), episode.targets, strict=True)
+            result[0, self._columns_of[i]] = np.concatenate([e[t.mask] for e, t in pairs])
         return result
 
     def divided(self, most: int) -> tuple[tuple[ReplayProblem, float], ...]:
@@ -196,10 +190,12 @@ class ReplayProblem:
         """Episodes that are simulated together."""
         return parties([e.replay for e in self.episodes])
 
-    def _simulate(
-        self, party: tuple[int, ...], candidates: FloatArray
-    ) -> Iterator[tuple[slice, tuple[Outputs, ...]]]:
-        return chunks_together([self.episodes[i].replay for i in party], candidates)
+    def _simulated(self, candidates: FloatArray) -> Iterator[tuple[int, slice, Outputs]]:
+        """Episode, rows of the candidates, and what its sensors show."""
+        for party in self._parties:
+            for rows, together in chunks_together([self.episodes[i].replay for i in party], candidates):
+                for i, outputs in zip(party, together, strict=True):
+                    yield i, rows, outputs
 
     @cached_property
     def _columns_of(self) -> list[slice]:

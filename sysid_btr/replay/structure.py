@@ -70,10 +70,7 @@ def parameter_limbs(modifiers: Sequence[Modifier], where: dict[str, int]) -> lis
     """Limbs that each parameter of some modifiers acts on; empty for the whole robot."""
     result: list[frozenset[int]] = []
     for modifier in modifiers:
-        places: list[tuple[str, ...]] = (
-            [modifier.places] if len(modifier.groups) == 1 else [(p,) for p in modifier.places]
-        )
-        for group in places:
+        for group in modifier.grouped:
             found = frozenset(where.get(name, EVERYWHERE) for name in group)
             result += [frozenset() if EVERYWHERE in found else found] * len(modifier.kinds)
     return result
