@@ -180,7 +180,8 @@ def fit(
         replays += polished.evaluations
         values, jacobian, residual = _at_optimum(problem, polished, step)
     if study.free:
-        weighed = weigh_walks(study, problem, values, jacobian, residual)
+        follow = isinstance(estimator, LeastSquares)
+        weighed = weigh_walks(study, problem, values, jacobian, residual, follow=follow)
         values, jacobian, residual = weighed.values, weighed.jacobian, weighed.residual
         shift = np.hypot(shift, weighed.error)
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift)
@@ -296,7 +297,13 @@ class Weighed:
 
 
 def weigh_walks(
-    study: Study, problem: ReplayProblem, values: FloatArray, jacobian: FloatArray, residual: FloatArray
+    study: Study,
+    problem: ReplayProblem,
+    values: FloatArray,
+    jacobian: FloatArray,
+    residual: FloatArray,
+    *,
+    follow: bool = True,
 ) -> Weighed:
     """What errors that every stride repeats do to estimates; beside other logs, walks count for less by them.
 
@@ -307,6 +314,8 @@ def weigh_walks(
     ----------
     study, problem : with at least one walk.
     values, jacobian, residual : (p,), (r, p), (r,) at the optimum, whitened.
+    follow : whether the estimates may; else all logs count by their noise. What another estimator or distance has found
+        stays where it is.
     """
     walked, moved = walked_residuals(problem), _placed_elsewhere(study, problem.modifiers, values)
     if moved is None:
@@ -332,7 +341,7 @@ def weigh_walks(
         std = np.sqrt(np.diag(covariance(found.jacobian, found.residual, problem.blocks)))
         return float(np.mean(np.log(np.clip(np.hypot(std, found.error) / span, 1e-12, 1.0))))
 
-    return weighed(1.0) if walked.all() else min(map(weighed, WEIGHTS), key=doubt)
+    return min(map(weighed, WEIGHTS), key=doubt) if follow and not walked.all() else weighed(1.0)
 
 
 WEIGHTS = tuple(np.geomspace(1.0, 0.01, 9).tolist())
