@@ -144,9 +144,9 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
         axis=1,
     )
     tracks = smooth_joints(time, measured)
-    gyro = _imu(log, ("gyro_x", "gyro_y", "gyro_z"))
+    gyro = imu_columns(log, ("gyro_x", "gyro_y", "gyro_z"))
     rates = smooth_joints(time, gyro)
-    up, up_std = _vertical(log, gyro, lost)
+    up, up_std = vertical(log, gyro, lost)
     gyro_std = float(np.mean([noise_floor(c).sigma for c in gyro.T]))
     rotation, rotation_std = smooth_orientation(time, gyro, up, gyro_std, up_std)
     tilt = np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0))
@@ -167,7 +167,7 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
         noise = np.mean(tracks.velocity_std, axis=1) * 2 + np.mean(rates.position_std, axis=1)
         spread.append(np.hypot(SLIDE_STD, arm * noise))
     bottom = np.stack(lowest, axis=1)
-    load = _loads(model, feet, log, lost)
+    load = foot_loads(model, feet, log, lost)
     contact = find_contacts(bottom, load)
     force = _specific_force(model, log, rates, lost)
     position, velocity = _follow(
@@ -224,6 +224,16 @@ def find_contacts(bottom: FloatArray, load: FloatArray | None) -> BoolArray:
     return np.asarray((held > LOADED * weight) & (above < LOWEST))
 
 
+def lowest_points(model: mujoco.MjModel, feet: Sequence[Foot], base: BaseState) -> FloatArray:
+    """(n, f) height of each foot's lowest point above the base's origin, m (negative down)."""
+    addresses = np.array([model.jnt_qposadr[model.joint(j).id] for j in base.joints], dtype=np.int64)
+    low = [
+        (np.einsum("nj,nkj->nk", base.rotation[:, 2], points) - foot.radius).min(axis=1)
+        for foot, points in zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True)
+    ]
+    return np.stack(low, axis=1)
+
+
 def _feet(model: mujoco.MjModel) -> tuple[Foot, ...]:
     if base_body(model) < 0:
         raise ModelError("the log says that its base was free, and the model has no free joint: give the free model")
@@ -236,7 +246,14 @@ def _feet(model: mujoco.MjModel) -> tuple[Foot, ...]:
     return feet
 
 
-def _imu(log: Log, names: tuple[str, ...]) -> FloatArray:
+def imu_columns(log: Log, names: tuple[str, ...]) -> FloatArray:
+    """Columns of the inertial unit, (n, k), with single missing values interpolated.
+
+    Raises
+    ------
+    LogError
+        If one of them is missing or empty.
+    """
     missing = [f"imu.{n}" for n in names if not log.has("imu", n)]
     if missing:
         raise LogError(
@@ -253,19 +270,20 @@ def _imu(log: Log, names: tuple[str, ...]) -> FloatArray:
     return values
 
 
-def _vertical(log: Log, gyro: FloatArray, lost: list[str]) -> tuple[FloatArray, FloatArray]:
+def vertical(log: Log, gyro: FloatArray, lost: list[str]) -> tuple[FloatArray, FloatArray]:
     """Measured vertical in the base's frame, and its standard deviation."""
     if log.has("imu", "angle_x") and log.has("imu", "angle_y"):
-        angles = _imu(log, ("angle_x", "angle_y"))
+        angles = imu_columns(log, ("angle_x", "angle_y"))
         sigma = float(np.mean([noise_floor(c).sigma for c in np.unwrap(angles, axis=0).T]))
         return up_in_base(angles[:, 0], angles[:, 1]), np.full(len(angles), max(sigma, 1e-4))
-    force = _imu(log, ("acc_x", "acc_y", "acc_z"))
+    force = imu_columns(log, ("acc_x", "acc_y", "acc_z"))
     size = np.linalg.norm(force, axis=1)
     lost.append("no inclinometer: the vertical is the accelerometer's, less sure while the robot accelerates")
     return force / size[:, None], TILT_STD + np.abs(size - GRAVITY) / GRAVITY + 0.05
 
 
-def _loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list[str]) -> FloatArray | None:
+def foot_loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list[str]) -> FloatArray | None:
+    """Force on each foot, (n, f); None, and what that means in `lost`, where nothing measures it."""
     columns = force_columns(model, feet, log.joints("force"))
     if not any(columns):
         lost.append(
@@ -284,7 +302,7 @@ def _specific_force(model: mujoco.MjModel, log: Log, rates: Tracks, lost: list[s
     if not all(log.has("imu", a) for a in names):
         lost.append("no accelerometer: the velocity between two stances is interpolated")
         return None
-    force = _imu(log, names)
+    force = imu_columns(log, names)
     noise = float(np.mean([noise_floor(c).sigma for c in force.T]))
     base = base_body(model)
     for s in range(model.nsite):

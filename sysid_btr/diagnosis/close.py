@@ -26,7 +26,7 @@ from sysid_btr.effects.library import select_effects
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift, weigh_walks
+from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.refit import (
     Fitted,
@@ -41,6 +41,7 @@ from sysid_btr.identify.refit import (
 )
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.study import Study
+from sysid_btr.identify.weighing import weigh_walks
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import body_names, joint_names, servo_joints
 
@@ -160,7 +161,8 @@ def close(
     first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
     study = replace(first.study, journal=None if journal is None else journal.section())
     declared = first.modifiers
-    study, before = inflated(study, judge(study, declared, first.values, first.replays))
+    # hypotheses are compared where each fits best
+    study, before = inflated(study, judge(study, declared, first.optimum, first.replays))
     state = _State(before, ())
     steps = [StepRecord((), (), before.train, before.holdout)]
     replays = first.replays
@@ -233,13 +235,16 @@ def close(
         replays += polished.evaluations
         state = replace(state, fitted=polished)
     final_estimates: tuple[Estimate, ...] = first.estimates
+    last = state.fitted
+    if not state.effects and study.free:
+        last = judge(study, declared, first.values)
     if state.effects:
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="intervals")
-        final_estimates, study, state = _estimates(study, state)
+        final_estimates, study, state, last = _estimates(study, state)
         real = _told_apart_from_nothing(study, state, declared, final_estimates)
         if real is not None:
             steps.append(StepRecord((), _named_only_in(state, real), real.fitted.train, real.fitted.holdout))
-            final_estimates, study, state = _estimates(study, real)
+            final_estimates, study, state, last = _estimates(study, real)
     count = sum(len(m.parameters) for m in declared)
     verdict = _verdict(study, before, state)
     later = later_split(study, state.fitted, _column_limit(state.fitted)) if verdict == "unexplained" else None
@@ -258,6 +263,7 @@ def close(
             alike=alike,
             rounds=rounds,
         )
+    state = replace(state, fitted=last)
     named = _named(study, state, before, final_estimates[count:], declared, candidates) if state.effects else ()
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
@@ -679,8 +685,12 @@ def _merge(study: Study, state: _State, declared: tuple[Modifier, ...]) -> _Stat
     return _State(fitted, tuple(merged), kept)
 
 
-def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study, _State]:
-    """Intervals in the final model; the step is halved while it moves an estimate by more than its error."""
+def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study, _State, Fitted]:
+    """Intervals in the final model, the study and state they are of, and the model as it is reported.
+
+    The step is halved while it moves an estimate by more than its error. The state stays where the residuals are least,
+    also where the motion of walks tells more than these do.
+    """
     for refinement in range(MAX_REFINEMENTS + 1):
         fitted = state.fitted
         problem = study.train_problem(fitted.modifiers, fitted.values)
@@ -689,13 +699,13 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
             jacobian = np.nan_to_num(jacobian)
         else:  # what half the step changes in the derivatives is far less than what is known of them
             residual = problem.residuals(fitted.values[None])[0]
-        shift = numerics_shift(problem, fitted.values, jacobian, residual)
+        shift, known = numerics_shift(problem, fitted.values, jacobian, residual), None
         if study.free:
             weighed = weigh_walks(study, problem, fitted.values, jacobian, residual)
             jacobian, residual = weighed.jacobian, weighed.residual
-            shift = np.hypot(shift, weighed.error)
+            shift, known = np.hypot(shift, weighed.error), weighed.known
             fitted = replace(fitted, values=weighed.values)
-        found = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift)
+        found = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift, known)
         bare = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks)
         told = np.array([e.identifiable != "no" for e in bare])
         worst = np.max(np.abs(shift[told]) / np.maximum([e.std for e in bare], 1e-300)[told], initial=0.0)
@@ -705,8 +715,8 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, fitted.modifiers, fitted.values, iterations=4))
     values, found, _ = hold_unidentifiable(problem, fitted.values, found, jacobian)
-    fitted = judge(study, fitted.modifiers, values)
-    return found, study, replace(state, fitted=fitted)
+    last = judge(study, fitted.modifiers, values)
+    return found, study, replace(state, fitted=last) if known is None else state, last
 
 
 def _told_apart_from_nothing(

@@ -15,12 +15,13 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Te
 from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.identify.deferred import corrected, deferred_fit
-from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, covariance, estimates
+from sysid_btr.identify.deferred import deferred_fit
+from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, estimates, newton
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
-from sysid_btr.identify.walk import GROUND, Walk, of_legs, repeated_error, walked_residuals
+from sysid_btr.identify.walk import Walk
+from sysid_btr.identify.weighing import weigh_walks
 from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
@@ -60,6 +61,7 @@ class Fit:
     numerics_shift : (p,) change of the estimates when the step is halved; on walks with the error of `weigh_walks`.
     replays : candidates simulated.
     seconds : wall time.
+    optimum : (p,) where the residuals alone are least: `values`, but for walks whose motion tells more than replays do.
     profiles : likelihood along single parameters, where it was asked for (`identify.profile`).
     """
 
@@ -73,6 +75,7 @@ class Fit:
     numerics_shift: FloatArray
     replays: int
     seconds: float
+    optimum: FloatArray
     profiles: tuple[Profile, ...] = ()
 
     def _repr_html_(self) -> str:
@@ -179,12 +182,13 @@ def fit(
         )
         replays += polished.evaluations
         values, jacobian, residual = _at_optimum(problem, polished, step)
+    known, optimum = None, values
     if study.free:
         follow = isinstance(estimator, LeastSquares)
         weighed = weigh_walks(study, problem, values, jacobian, residual, follow=follow)
         values, jacobian, residual = weighed.values, weighed.jacobian, weighed.residual
-        shift = np.hypot(shift, weighed.error)
-    found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift)
+        shift, known = np.hypot(shift, weighed.error), weighed.known
+    found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift, known)
     extra = 0
     if isinstance(estimator, LeastSquares):
         values, found, extra = hold_unidentifiable(problem, values, found, jacobian)
@@ -199,6 +203,7 @@ def fit(
         numerics_shift=shift,
         replays=replays + extra,
         seconds=perf_counter() - began,
+        optimum=values if known is None else optimum,
     )
 
 
@@ -276,103 +281,7 @@ def numerics_shift(
     fine = problem.with_numerics(numerics.halved()).residuals(values[None])[0]
     if not np.isfinite(fine).all():
         return np.full(len(values), np.inf)
-    return _newton(jacobian, fine - residual)
-
-
-@dataclass(frozen=True, eq=False)
-class Weighed:
-    """A linearised fit of walks, and of other logs.
-
-    Attributes
-    ----------
-    values : (p,) estimates.
-    jacobian, residual : (r, p) and (r,) there; of walks among other logs as much as they are believed.
-    error : (p,) standard deviation beyond that of pieces of the log that are independent.
-    """
-
-    values: FloatArray
-    jacobian: FloatArray
-    residual: FloatArray
-    error: FloatArray
-
-
-def weigh_walks(
-    study: Study,
-    problem: ReplayProblem,
-    values: FloatArray,
-    jacobian: FloatArray,
-    residual: FloatArray,
-    *,
-    follow: bool = True,
-) -> Weighed:
-    """What errors that every stride repeats do to estimates; beside other logs, walks count for less by them.
-
-    Weighed by the noise of its sensors alone, a walk would draw what a hanging robot tells better towards the errors
-    of its own contact. It counts as much as leaves the estimates most certain; they follow by one Gauss-Newton step.
-
-    Parameters
-    ----------
-    study, problem : with at least one walk.
-    values, jacobian, residual : (p,), (r, p), (r,) at the optimum, whitened.
-    follow : whether the estimates may; else all logs count by their noise. What another estimator or distance has found
-        stays where it is.
-    """
-    walked, moved = walked_residuals(problem), _placed_elsewhere(study, problem.modifiers, values)
-    if moved is None:
-        return Weighed(values, jacobian, residual, np.full(len(values), np.inf))
-    there, residual_there, walked_there = moved
-    beyond = np.where(of_legs(problem), GROUND**2 - 1, 0.0)
-    span = problem.upper - problem.lower
-
-    def weighed(weight: float) -> Weighed:
-        rows = np.where(walked, weight, 1.0)
-        j, r = jacobian * rows[:, None], residual * rows
-        step = np.zeros(len(values))
-        if weight < 1:
-            step = np.clip(_newton(j, r), problem.lower - values, problem.upper - values)
-        r = r + j @ step
-        rows = np.where(walked_there, weight, 1.0)
-        placed = np.clip(_newton(there * rows[:, None], residual_there * rows) - step, -span, span)
-        told = np.hypot(placed, repeated_error(problem, j, r))
-        # what the ground does wrong everywhere is as much again, and more
-        return Weighed(values + step, j, r, np.sqrt(told**2 + beyond * (told**2 + _noise_of(j, walked) ** 2)))
-
-    def doubt(found: Weighed) -> float:
-        std = np.sqrt(np.diag(covariance(found.jacobian, found.residual, problem.blocks)))
-        return float(np.mean(np.log(np.clip(np.hypot(std, found.error) / span, 1e-12, 1.0))))
-
-    return min(map(weighed, WEIGHTS), key=doubt) if follow and not walked.all() else weighed(1.0)
-
-
-WEIGHTS = tuple(np.geomspace(1.0, 0.01, 9).tolist())
-"""Factors by which the residuals of walks count beside those of other logs."""
-
-
-def _noise_of(jacobian: FloatArray, rows: BoolArray) -> FloatArray:
-    """Standard deviation (p,) of estimates by white noise of unit size in some rows of the residual."""
-    norm = np.linalg.norm(jacobian, axis=0)
-    norm = np.where(norm > 0, norm, 1.0)
-    unit = jacobian / norm
-    inverse = np.linalg.pinv(unit.T @ unit, rcond=RANK, hermitian=True)
-    return np.asarray(np.linalg.norm(unit[rows] @ inverse, axis=0) / norm)
-
-
-def _newton(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    return -np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0])
-
-
-def _placed_elsewhere(
-    study: Study, modifiers: tuple[Modifier, ...], values: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray] | None:
-    """Jacobian (r, p), residual (r,) and which of it is of walks, where windows begin elsewhere; None if that fails.
-
-    In the right model the change of the estimates is a part of the noise; in another it is the least that the model's
-    error does.
-    """
-    relaid = study.relaid().settled(modifiers, values, held=False)
-    problem = relaid.train_problem(modifiers, values)
-    residual, jacobian = linearise(corrected(problem, study.rough, values), values, step=study.stencil(modifiers))
-    return (jacobian, residual, walked_residuals(problem)) if np.isfinite(jacobian).all() else None
+    return newton(jacobian, fine - residual)
 
 
 def _at_optimum(

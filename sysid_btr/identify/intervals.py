@@ -55,6 +55,26 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of some parameters from elsewhere: normally distributed.
+
+    Attributes
+    ----------
+    which : (k,) positions among the parameters.
+    mean, covariance : (k,), (k, k).
+    """
+
+    which: IntArray
+    mean: FloatArray
+    covariance: FloatArray
+
+    def joined(self, mean: FloatArray, covariance: FloatArray) -> Known:
+        """With other knowledge of the same parameters, (k,) and (k, k), that is independent of this."""
+        gain = np.linalg.solve(self.covariance + covariance, covariance).T
+        return Known(self.which, mean + gain @ (self.mean - mean), covariance - gain @ covariance)
+
+
+@dataclass(frozen=True, eq=False)
 class Scatter:
     """How far estimates scatter, in coordinates in which white noise of unit size scatters them by the identity.
 
@@ -134,6 +154,11 @@ def covariance(jacobian: FloatArray, residual: FloatArray, blocks: IntArray) -> 
     return spread(jacobian, residual, blocks)[0]
 
 
+def newton(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """Change of the estimates, (p,), that a Gauss-Newton step makes; none in directions that no residual sees."""
+    return -np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0])
+
+
 def spread(jacobian: FloatArray, residual: FloatArray, blocks: IntArray) -> tuple[FloatArray, FloatArray]:
     """Covariance (p, p) as `covariance` has it, and the degrees of freedom (p,) of its variances."""
     p = jacobian.shape[1]
@@ -158,6 +183,7 @@ def estimates(
     residual: FloatArray,
     blocks: IntArray,
     numerics_shift: FloatArray | None = None,
+    known: Known | None = None,
 ) -> tuple[Estimate, ...]:
     """Estimates with intervals and a verdict on what this log can tell.
 
@@ -166,6 +192,7 @@ def estimates(
     parameters, values : (p,).
     jacobian, residual, blocks : as for `covariance`.
     numerics_shift : (p,) change of the estimates when the step is halved, if known.
+    known : all that is known of some of them, from these residuals and from elsewhere.
     """
     from scipy.stats import t as student
 
@@ -174,6 +201,9 @@ def estimates(
     if numerics_shift is not None:
         std = np.hypot(std, np.abs(numerics_shift))
     quantile = np.asarray(student.ppf(0.975, dof))
+    if known is not None:
+        std[known.which] = np.sqrt(np.diag(known.covariance))
+        quantile[known.which] = student.ppf(0.975, np.inf)
     norm = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
     result = []
     for i, (parameter, value) in enumerate(zip(parameters, values, strict=True)):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.models.modifier import Modifier, Outputs, Rig
 from sysid_btr.replay.engine import Replay, write_model
 from sysid_btr.replay.grid import Grid
+
+if TYPE_CHECKING:
+    from mujoco.batch import Batch
 
 SIMULATIONS = 96
 """Simulations of one batch."""
@@ -246,7 +250,7 @@ class WindowReplay(Replay):
         steps = max(int(frame.after[-1]), 1)
         starts = self._windows.chosen(window)
         if change is not None:
-            starts = starts.moved(change)
+            starts = starts.moved(change[:, : starts.std.shape[1]])
         if frame.late:
             late = np.zeros_like(starts.std)
             joints = starts.joint_position.shape[1]
@@ -272,6 +276,7 @@ class WindowReplay(Replay):
                 torque = modifier.applied_torque(rig, values, h * (first[0] + np.arange(steps + 1)))
                 if torque is not None:
                     applied = torque if applied is None else applied + torque
+        self.push(batch, window, change)
         index = self.index
         place, motion = self._free_joint
         bind_qpos, bind_qvel = batch.bind("qpos"), batch.bind("qvel")
@@ -291,6 +296,9 @@ class WindowReplay(Replay):
             fraction=frame.fraction,
         )
         return self._go(rig, pairs, command[:, lead:], applied, local)
+
+    def push(self, batch: Batch, window: IntArray, change: FloatArray | None) -> None:
+        """Let forces from outside act on a batch of windows; none do here."""
 
     @cached_property
     def _free_joint(self) -> tuple[int, int]:
