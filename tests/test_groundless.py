@@ -57,6 +57,14 @@ def test_knowledge_from_two_sources_is_weighed_by_its_precision() -> None:
     assert far.mean[0] == pytest.approx(1.0, abs=1e-6)
 
 
+def test_what_is_held_moves_what_is_known_of_the_others() -> None:
+    covariance = np.array([[0.04, -0.03, 0.0], [-0.03, 0.09, 0.01], [0.0, 0.01, 0.02]])
+    known = Known(np.array([1, 4, 5]), np.array([1.0, 2.0, 3.0]), covariance)
+    beside = known.beside(np.array([0, 4]), np.array([9.0, 2.5]))
+    np.testing.assert_allclose(beside, [1.0 - 0.03 / 0.09 * 0.5, 2.5, 3.0 + 0.01 / 0.09 * 0.5])
+    np.testing.assert_allclose(known.beside(np.array([0]), np.array([9.0])), known.mean)
+
+
 def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
     rng = np.random.default_rng(8)
     n, joints, feet, p = 5, 3, 2, 4

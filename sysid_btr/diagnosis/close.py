@@ -714,7 +714,7 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
             break
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, fitted.modifiers, fitted.values, iterations=4))
-    values, found, _ = hold_unidentifiable(problem, fitted.values, found, jacobian)
+    values, found, _ = hold_unidentifiable(problem, fitted.values, found, jacobian, known)
     last = judge(study, fitted.modifiers, values)
     return found, study, replace(state, fitted=last) if known is None else state, last
 

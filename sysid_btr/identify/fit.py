@@ -16,7 +16,7 @@ from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.deferred import deferred_fit
-from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, estimates, newton
+from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, Known, estimates, newton
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
@@ -191,7 +191,7 @@ def fit(
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift, known)
     extra = 0
     if isinstance(estimator, LeastSquares):
-        values, found, extra = hold_unidentifiable(problem, values, found, jacobian)
+        values, found, extra = hold_unidentifiable(problem, values, found, jacobian, known)
     return Fit(
         study=study,
         modifiers=modifiers,
@@ -294,7 +294,11 @@ def _at_optimum(
 
 
 def hold_unidentifiable(
-    problem: ReplayProblem, values: FloatArray, found: tuple[Estimate, ...], jacobian: FloatArray
+    problem: ReplayProblem,
+    values: FloatArray,
+    found: tuple[Estimate, ...],
+    jacobian: FloatArray,
+    known: Known | None = None,
 ) -> tuple[FloatArray, tuple[Estimate, ...], int]:
     """Hold what the log cannot tell at its nominal value, and refit the rest: values, estimates, evaluations.
 
@@ -319,7 +323,11 @@ def hold_unidentifiable(
     free_loss, held_loss = problem.loss(np.stack([values, complete]))
     if not held_loss <= free_loss * WORSE:
         return values, found, result.evaluations + 2
-    values = complete
+    return complete, _held(complete, found, blind), result.evaluations
+
+
+def _held(values: FloatArray, found: tuple[Estimate, ...], blind: BoolArray) -> tuple[Estimate, ...]:
+    """Estimates at these values, the blind ones said to be held; intervals cover these values too."""
     moved = []
     for estimate, value, fixed in zip(found, values, blind, strict=True):
         low, high = estimate.bounds if estimate.identifiable == "no" else estimate.ci95
@@ -328,7 +336,7 @@ def hold_unidentifiable(
         at_bound = bool(min(value - estimate.bounds[0], estimate.bounds[1] - value) <= 1e-6 * span)
         ci95 = (min(low, float(value)), max(high, float(value)))
         moved.append(replace(estimate, value=float(value), ci95=ci95, reason=reason, at_bound=at_bound))
-    return values, tuple(moved), result.evaluations
+    return tuple(moved)
 
 
 ENOUGH = 0.03

@@ -49,7 +49,7 @@ MISFIT = 1.0
 STEADY, LEVER = 20.0, 0.07
 """Standard deviation of the mean force on a foot over a sample, in weights of the robot: as good as free. Times the
 lever (m) it is that of the torque."""
-JOLTS = (0.0005, 0.001, 0.002, 0.004, 0.008)
+JOLTS = (0.0001, 0.0003, 0.001, 0.003, 0.009)
 """The same of what the force does beside its mean, at either end of a sample, in weights times seconds: the likeliest
 of these, as a loose one lets noise pass for motion."""
 GRAVITY = 9.81
@@ -63,9 +63,9 @@ NUDGE = (0.01, 0.001, 0.01, 0.01, 0.001, 0.02)
 NUDGE_FORCE, NUDGE_TORQUE = 1.0, 0.1
 NUDGE_NUMBER = 0.02
 """... and the same for the numbers: fractions of their ranges."""
-LATE = 0.0005
-"""s, standard deviation of what sensors and commands may be apart in time beyond the model: half a tick of a loop at
-1 kHz. A gain and a fraction of a millisecond look much alike."""
+LATE = 0.001
+"""s, standard deviation of what sensors and commands may be apart in time beyond the model: a tick of a loop at 1 kHz.
+A gain and a fraction of a millisecond look much alike."""
 LEAST = 50
 """Samples that a walk must have."""
 

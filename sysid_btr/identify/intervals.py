@@ -68,6 +68,15 @@ class Known:
     mean: FloatArray
     covariance: FloatArray
 
+    def beside(self, which: IntArray, values: FloatArray) -> FloatArray:
+        """Mean of all, (k,), where some of them, by position among all parameters, have these values."""
+        fixed = np.isin(self.which, which)
+        if not fixed.any():
+            return self.mean
+        own = self.covariance[np.ix_(fixed, fixed)]
+        pull = np.linalg.solve(own, values[np.isin(which, self.which)] - self.mean[fixed])
+        return np.asarray(self.mean + self.covariance[:, fixed] @ pull)
+
     def joined(self, mean: FloatArray, covariance: FloatArray) -> Known:
         """With other knowledge of the same parameters, (k,) and (k, k), that is independent of this."""
         gain = np.linalg.solve(self.covariance + covariance, covariance).T
