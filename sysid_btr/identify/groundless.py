@@ -40,7 +40,7 @@ ROUNDS = 6
 SETTLED = 0.25
 """Standard errors by which a step moves an estimate when it is the last."""
 SIZED = 3
-"""Of these the first in which the size of jolts is chosen anew."""
+"""Of these the first in which the size of jolts is chosen anew, once states have moved."""
 COARSE = 0.004
 """s, longest step of the fourth-order integrator with which derivatives are taken."""
 MISFIT = 1.0
@@ -228,7 +228,7 @@ def without_ground(problem: ReplayProblem, values: FloatArray) -> Known | None:
     settled = False
     for k in range(ROUNDS):
         ends = [_simulate(chain, now, free, NUDGE_NUMBER * span) for chain in chains]
-        if k < SIZED:
+        if 0 < k < SIZED:
             chains = [_likeliest(*parts) for parts in zip(chains, known, ends, strict=True)]
         rounds = [_linearise(*parts) for parts in zip(chains, known, ends, strict=True)]
         if not all(np.isfinite(r.surprise) for r in rounds):
