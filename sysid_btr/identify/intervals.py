@@ -212,6 +212,8 @@ def estimates(
     quantile = np.asarray(student.ppf(0.975, dof))
     if known is not None:
         std[known.which] = np.sqrt(np.diag(known.covariance))
+        cov[known.which], cov[:, known.which] = 0.0, 0.0
+        cov[np.ix_(known.which, known.which)] = known.covariance
         quantile[known.which] = student.ppf(0.975, np.inf)
     norm = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
     result = []
