@@ -60,9 +60,12 @@ def test_knowledge_from_two_sources_is_weighed_by_its_precision() -> None:
 def test_what_is_held_moves_what_is_known_of_the_others() -> None:
     covariance = np.array([[0.04, -0.03, 0.0], [-0.03, 0.09, 0.01], [0.0, 0.01, 0.02]])
     known = Known(np.array([1, 4, 5]), np.array([1.0, 2.0, 3.0]), covariance)
-    beside = known.beside(np.array([0, 4]), np.array([9.0, 2.5]))
+    values = np.array([9.0, 1.0, 9.0, 9.0, 2.5, 3.0])
+    beside = known.beside(np.array([0, 4]), values)
     np.testing.assert_allclose(beside, [1.0 - 0.03 / 0.09 * 0.5, 2.5, 3.0 + 0.01 / 0.09 * 0.5])
-    np.testing.assert_allclose(known.beside(np.array([0]), np.array([9.0])), known.mean)
+    np.testing.assert_allclose(known.beside(np.array([0]), values), known.mean)
+    low = np.array([0.0, 0.0, 0.0, 0.0, 2.5, 0.0])
+    np.testing.assert_allclose(known.within(low, np.full(6, 9.0)), beside)
 
 
 def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:

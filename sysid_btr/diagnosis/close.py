@@ -263,12 +263,12 @@ def close(
             alike=alike,
             rounds=rounds,
         )
-    state = replace(state, fitted=last)
     named = _named(study, state, before, final_estimates[count:], declared, candidates) if state.effects else ()
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
     if verdict == "unexplained" or (kept and _something_left(before, state.fitted)):
         left = signature(study, state.fitted.modifiers, state.fitted.values)
+    state = replace(state, fitted=last)
     after = score(study, state.fitted.modifiers, state.fitted.values)
     unit = "m" if all(s.slide for s in study.scales.values()) else "rad"
     return Closing(

@@ -61,7 +61,7 @@ class Fit:
     numerics_shift : (p,) change of the estimates when the step is halved; on walks with the error of `weigh_walks`.
     replays : candidates simulated.
     seconds : wall time.
-    optimum : (p,) where the residuals alone are least: `values`, but for walks whose motion tells more than replays do.
+    optimum : (p,) `values`, but for walks whose motion tells more than replays do: there, where residuals are least.
     profiles : likelihood along single parameters, where it was asked for (`identify.profile`).
     """
 
@@ -305,8 +305,17 @@ def hold_unidentifiable(
     Of parameters that the log tells only together, as few are held as it takes to tell the others: to hold them all
     would contradict what is known of them together. The intervals stay those of the joint fit, about its own
     estimates, so they still cover whatever value the held parameters really have. Nothing is held where that predicts
-    the log worse: the intervals are those of a linear model, and of the model's own error where there is one.
+    the log worse: the intervals are those of a linear model, and of the model's own error where there is one. Where
+    more is known of the parameters than the residuals tell, that says what the others are beside those that are held.
     """
+    if known is not None:
+        blind = np.array([e.identifiable == "no" for e in found])
+        if not blind.any() or blind.all():
+            return values, found, 0
+        values = np.where(blind, [e.nominal for e in found], values)
+        values[known.which] = known.beside(np.flatnonzero(blind), values)
+        values = np.clip(values, problem.lower, problem.upper)
+        return values, _held(values, found, blind), 0
     blind = fewest_to_hold(jacobian, found)
     if not blind.any() or blind.all():
         return values, found, 0

@@ -267,8 +267,28 @@ def _suits(replay: WindowReplay) -> bool:
         and float(np.ptp(np.diff(time))) < 1e-4 * float(time[1] - time[0])
         and replay.numerics.servo_period is None
         and replay.numerics.integrator != "Euler"
-        and not any(m.structural or m.overrides("start_law") or m.overrides("applied_torque") for m in kinds)
+        and not any(m.structural or any(m.overrides(hook) for hook in BEYOND) for m in kinds)
+        and not any(name.startswith("opt.") for name in _written(replay, _nominal(replay)).touched)
     )
+
+
+BEYOND = ("start_law", "applied_torque", "initial_state", "read_out")
+"""Stages of a modifier that take more than a step from one state to the next: memory, clocks, sensors."""
+
+
+def _nominal(replay: WindowReplay) -> FloatArray:
+    return np.array([p.nominal for p in replay.parameters])
+
+
+def _written(replay: WindowReplay, values: FloatArray) -> Rig:
+    """A rig with a candidate's numbers in its fields."""
+    from mujoco.batch import Batch
+
+    from sysid_btr.models.modifier import Rig
+
+    rig = Rig(replay.model, Batch(replay.model, 1, 1), replay.index, replay.grid.timestep)
+    write_model(rig, replay._values(values[None]))
+    return rig
 
 
 def _chain(replay: WindowReplay) -> _Chain:
@@ -292,7 +312,9 @@ def _chain(replay: WindowReplay) -> _Chain:
     up, up_std = vertical(walk, gyro, [])
     joints = [walk.channels[f"position.{j}"] if walk.has("position", j) else np.full(n, np.nan) for j in base.joints]
     measured = np.column_stack([*joints, gyro, up[:, :2]])
-    noise = [noise_floor(c).sigma if np.isfinite(c).any() else np.inf for c in (*joints, *gyro.T)]
+    noise = np.array([noise_floor(c).sigma if np.isfinite(c).any() else np.inf for c in (*joints, *gyro.T)])
+    # a joint that stands still shows no noise, and is known no better than the others
+    noise[: len(joints)] = np.maximum(noise[: len(joints)], 0.5 * np.median(noise[: len(joints)]))
     sigma = np.column_stack([np.tile(noise, (n, 1)), up_std, up_std])
     sigma[~np.isfinite(measured) | ~base.usable[:, None]] = np.inf
     return _Chain(
@@ -387,17 +409,11 @@ def _blows(chain: _Chain, values: FloatArray) -> FloatArray:
 def candidate_model(replay: WindowReplay, values: FloatArray) -> mujoco.MjModel:
     """The compiled model with a candidate's numbers in it."""
     import mujoco
-    from mujoco.batch import Batch
 
-    from sysid_btr.models.modifier import Rig
-
-    model = copy.copy(replay.model)
-    rig: Rig = Rig(model, Batch(replay.model, 1, 1), replay.index, replay.grid.timestep)
-    write_model(rig, replay._values(values[None]))
+    model, rig = copy.copy(replay.model), _written(replay, values)
     for name in rig.touched:
-        if not name.startswith("opt."):
-            field = getattr(model, name)
-            field[...] = np.asarray(rig.array(name))[0].reshape(field.shape)
+        field = getattr(model, name)
+        field[...] = np.asarray(rig.array(name))[0].reshape(field.shape)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
@@ -461,9 +477,10 @@ def _linearise(chain: _Chain, known: _Derivatives, ends: _Ends) -> _Round:
         [known.start, np.tile(np.eye(d), (w, 1, 1)), ends.by_number, ends.defect[:, :, None]], axis=2
     )
     linked = chain.linked[:, None, None]
+    right = np.where(linked, right, 0.0)
     try:
-        factor = np.linalg.cholesky(_unexplained(chain, known)[2])
-        white = np.linalg.solve(factor, right) * linked
+        factor = np.linalg.cholesky(np.where(linked, _unexplained(chain, known)[2], np.eye(d)))
+        white = np.linalg.solve(factor, right)
         before, after, sides = white[:, :, :d], -white[:, :, d : 2 * d], white[:, :, 2 * d :]
         # what the candidate as it is leaves comes first, then a unit of each number
         sides = np.roll(sides, 1, axis=2)
@@ -544,10 +561,13 @@ def _moved(chain: _Chain, known: _Derivatives, found: _Round, change: FloatArray
     rest = rest + found.ends.by_number @ change
     # least-norm forces, each in its own size, that explain what the steps leave open
     sizes, forces, total = _unexplained(chain, known)
+    linked = chain.linked[:, None, None]
+    forces, total = np.where(linked, forces, 0.0), np.where(linked, total, np.eye(d))
+    rest = np.where(linked[:, :, 0], rest, 0.0)
     pushed = -np.einsum("ndm,nd->nm", forces, np.linalg.solve(total, rest[:, :, None])[:, :, 0]) * sizes
     wrench = chain.steps.wrench
     assert wrench is not None
-    mean = pushed[:, : wrench[0].size].reshape(wrench.shape) * chain.linked[:, None, None]
+    mean = pushed[:, : wrench[0].size].reshape(wrench.shape)
     states = chain.states.moved(move)
     steps = replace(chain.steps, windows=states.chosen(np.arange(n - 1)), wrench=wrench + mean)
     return replace(chain, steps=steps, states=states)

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.models.modifier import Parameter
 
 Identifiable = Literal["yes", "weak", "no"]
@@ -68,13 +68,20 @@ class Known:
     mean: FloatArray
     covariance: FloatArray
 
-    def beside(self, which: IntArray, values: FloatArray) -> FloatArray:
-        """Mean of all, (k,), where some of them, by position among all parameters, have these values."""
-        fixed = np.isin(self.which, which)
+    def beside(self, held: IntArray, values: FloatArray) -> FloatArray:
+        """Mean, (k,), where some parameters, by position among all, are held at what they are in `values` (p,)."""
+        return self._pulled(np.isin(self.which, held), values[self.which])
+
+    def within(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        """Mean, (k,), where those beyond their bounds, (p,), lie on them."""
+        low, high = lower[self.which], upper[self.which]
+        return np.clip(self._pulled((self.mean < low) | (self.mean > high), np.clip(self.mean, low, high)), low, high)
+
+    def _pulled(self, fixed: BoolArray, values: FloatArray) -> FloatArray:
         if not fixed.any():
             return self.mean
         own = self.covariance[np.ix_(fixed, fixed)]
-        pull = np.linalg.solve(own, values[np.isin(which, self.which)] - self.mean[fixed])
+        pull = np.linalg.solve(own, values[fixed] - self.mean[fixed])
         return np.asarray(self.mean + self.covariance[:, fixed] @ pull)
 
     def joined(self, mean: FloatArray, covariance: FloatArray) -> Known:

@@ -63,7 +63,7 @@ def weigh_walks(
     there, residual_there, walked_there = moved
     legs = of_legs(problem)
     # beside a robot that hangs, a walk does as much harm to them as it has a say
-    masses = legs & walked.all() & np.array([p.name.startswith("mass:") for p in problem.parameters])
+    masses = legs & walked.all() & _is_mass(problem)
     span = problem.upper - problem.lower
 
     def weighed(weight: float) -> Weighed:
@@ -117,41 +117,52 @@ def _apart(
     step = newton(held, left)
     cov = covariance(held, left + held @ step, problem.blocks[~walked])[np.ix_(which, which)]
     span = (problem.upper - problem.lower)[which]
-    joined = found.known.joined((values + step)[which], bounded(cov, np.zeros(len(which)), span))
-    change = np.zeros(len(values))
-    change[which] = joined.mean - values[which]
-    change[others] = newton(own[:, others], rest + own[:, which] @ change[which])
-    change = np.clip(change, problem.lower - values, problem.upper - values)
-    return Weighed(values + change, jacobian, residual + jacobian @ change, found.error, joined)
+    joined = found.known.joined((values + step)[which], bounded(cov, span))
+    moved = values.copy()
+    moved[which] = joined.within(problem.lower, problem.upper)
+    moved[others] += newton(own[:, others], rest + own @ (moved - values))
+    moved = np.clip(moved, problem.lower, problem.upper)
+    return Weighed(moved, jacobian, residual + jacobian @ (moved - values), found.error, joined)
 
 
 def with_motion(problem: ReplayProblem, weighed: Weighed) -> Weighed:
     """A fit of walks with what their motion tells whatever the ground is.
 
-    Both use the same encoders. What the fit tells counts as little as its ground may be wrong, so that it adds little,
-    and counting its part of the noise as its own does no harm.
+    Both use the same encoders, so that only masses of legs are joined, which the fit tells so badly that counting its
+    part of the noise as its own does no harm. All else is what the motion tells.
     """
     free = without_ground(problem, weighed.values)
     if free is None:
         return weighed
     own, others = free.which, np.setdiff1d(np.arange(len(weighed.values)), free.which)
-    cov = covariance(weighed.jacobian, weighed.residual, problem.blocks)[np.ix_(own, own)]
-    joined = free.joined(weighed.values[own], bounded(cov, weighed.error[own], (problem.upper - problem.lower)[own]))
-    change = np.zeros(len(weighed.values))
-    change[own] = joined.mean - weighed.values[own]
+    span = problem.upper - problem.lower
+    legs = of_legs(problem) & _is_mass(problem)
+    cov = covariance(weighed.jacobian, weighed.residual, problem.blocks)
+    cov = np.where(legs & legs[:, None], cov, 0.0) + np.diag(np.where(legs, weighed.error, WIDE * span) ** 2)
+    joined = free.joined(weighed.values[own], bounded(cov[np.ix_(own, own)], WIDE * span[own]))
+    moved = weighed.values.copy()
+    moved[own] = joined.within(problem.lower, problem.upper)
     # those of the ground go where the log wants them beside these
-    change[others] = newton(weighed.jacobian[:, others], weighed.jacobian[:, own] @ change[own])
-    change = np.clip(change, problem.lower - weighed.values, problem.upper - weighed.values)
-    residual = weighed.residual + weighed.jacobian @ change
-    return replace(weighed, values=weighed.values + change, residual=residual, known=joined)
+    change = moved - weighed.values
+    moved[others] += newton(weighed.jacobian[:, others], weighed.residual + weighed.jacobian @ change)
+    moved = np.clip(moved, problem.lower, problem.upper)
+    residual = weighed.residual + weighed.jacobian @ (moved - weighed.values)
+    return replace(weighed, values=moved, residual=residual, known=joined)
 
 
-def bounded(cov: FloatArray, error: FloatArray, span: FloatArray) -> FloatArray:
-    """Covariance (k, k) widened by further errors (k,), and no wider than the range of the bounds (k,)."""
-    blind = ~np.isfinite(np.diag(cov)) | ~np.isfinite(error)
-    cov = np.where(blind | blind[:, None], 0.0, cov) + np.diag(np.where(blind, span, error) ** 2)
-    shrink = np.minimum(span / np.sqrt(np.diag(cov)), 1.0)
-    return np.asarray(cov * np.outer(shrink, shrink))
+WIDE = 100.0
+"""Ranges of the bounds that are the standard deviation of what nothing is known of."""
+
+
+def bounded(cov: FloatArray, span: FloatArray) -> FloatArray:
+    """Covariance (k, k) beside the knowledge that each number lies within so much, (k,)."""
+    blind = ~np.isfinite(np.diag(cov))
+    cov = np.where(blind | blind[:, None], 0.0, cov) + np.diag(np.where(blind, (WIDE * span) ** 2, 0.0))
+    return np.asarray(cov - cov @ np.linalg.solve(cov + np.diag(span**2), cov))
+
+
+def _is_mass(problem: ReplayProblem) -> BoolArray:
+    return np.array([p.name.startswith("mass:") for p in problem.parameters])
 
 
 WEIGHTS = tuple(np.geomspace(1.0, 0.01, 9).tolist())
