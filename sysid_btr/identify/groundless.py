@@ -121,6 +121,10 @@ class SampleSteps(WindowReplay):
             for sims, part in self._simulate(candidates, row, window, change):
                 assert part.base is not None
                 base[sims], q[sims], dq[sims] = part.base[:, -1], part.position[:, -1], part.velocity[:, -1]
+        # a simulation that failed has no attitude; the rest of it says so
+        failed = ~(np.linalg.norm(base[:, 3:7], axis=1) > 0.5)
+        base[failed] = np.nan
+        base[failed, 3:7] = 1.0, 0.0, 0.0, 0.0
         std = np.zeros((size, BASE + 2 * j))
         rows = np.asarray(self._windows.rows[window])
         return Windows(rows, base[:, :3], base[:, 3:7], base[:, 7:10], base[:, 10:], q, dq, std)

@@ -131,7 +131,10 @@ def with_motion(problem: ReplayProblem, weighed: Weighed) -> Weighed:
     Both use the same encoders, so that only masses of legs are joined, which the fit tells so badly that counting its
     part of the noise as its own does no harm. All else is what the motion tells.
     """
-    free = without_ground(problem, weighed.values)
+    try:
+        free = without_ground(problem, weighed.values)
+    except np.linalg.LinAlgError:  # a model so wrong that no step finds a better one
+        free = None
     if free is None:
         return weighed
     own, others = free.which, np.setdiff1d(np.arange(len(weighed.values)), free.which)
