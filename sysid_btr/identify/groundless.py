@@ -482,6 +482,9 @@ def _linearise(chain: _Chain, known: _Derivatives, ends: _Ends) -> _Round:
     )
     linked = chain.linked[:, None, None]
     right = np.where(linked, right, 0.0)
+    failed = _Round(np.zeros((1, 1 + p)), np.zeros(1, dtype=np.int64), np.inf, np.zeros((n * d, 1 + p)), ends)
+    if not np.isfinite(right).all():  # a simulation failed
+        return failed
     try:
         factor = np.linalg.cholesky(np.where(linked, _unexplained(chain, known)[2], np.eye(d)))
         white = np.linalg.solve(factor, right)
@@ -497,8 +500,8 @@ def _linearise(chain: _Chain, known: _Derivatives, ends: _Ends) -> _Round:
         linear[:-1] += before.transpose(0, 2, 1) @ sides
         linear[1:] += after.transpose(0, 2, 1) @ sides
         band = cholesky_banded(_band(diagonal, after.transpose(0, 2, 1) @ before), lower=True)
-    except (np.linalg.LinAlgError, ValueError):  # a simulation failed
-        return _Round(np.zeros((1, 1 + p)), np.zeros(1, dtype=np.int64), np.inf, np.zeros((n * d, 1 + p)), ends)
+    except (np.linalg.LinAlgError, ValueError):
+        return failed
     solved = cho_solve_banded((band, True), linear.reshape(n * d, 1 + p))
     states = solved.reshape(n, d, 1 + p)
     missed = sides - before @ states[:-1] - after @ states[1:]
