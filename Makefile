@@ -9,7 +9,7 @@ FIND_PYTHON = for p in $(PYTHON) python3 python3.13 python3.12 python3.11 python
   && echo $$p && exit 0; done; \
   echo "no Python 3.11 or newer with venv: install one, or say make PYTHON=/path/to/python3" >&2; exit 1
 PYTEST_FLAGS ?= -n 2 --dist loadfile -q
-SOURCES := sysid_btr tests benchmarks sample_logs notebooks docs
+SOURCES := sysid_btr reference_simulator tests benchmarks sample_logs notebooks docs
 
 .PHONY: demo test lint types check notebooks docs dev format clean
 

@@ -26,8 +26,8 @@ from sysid_btr.btr.task import Walk
 from sysid_btr.btr.world import make_world
 from sysid_btr.estimators import Budget, GeneticAlgorithm, Journal, silent
 from sysid_btr.models.ant import UNKNOWN
-from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.robot import load_robot
+from sysid_btr.terms.grammar import parse_parameters
 
 RANGE = (0.75, 1.25)
 TASK = Walk(3.0)
@@ -67,12 +67,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run_seed(seed: int, plan: Plan, out: Path, threads: int) -> dict[str, Any]:
     """One hidden ant: the loop and what it is compared with."""
     model, space = load_robot("ant"), ant_gait()
-    modifiers = parse_parameters([f"length:{','.join(UNKNOWN)}"], model)
+    terms = parse_parameters([f"length:{','.join(UNKNOWN)}"], model)
     truth = np.random.default_rng([seed, 1000]).uniform(*RANGE, len(UNKNOWN))
-    stage = Stage(make_world(model, TASK, modifiers, threads=threads), TASK, space)
+    stage = Stage(make_world(model, TASK, terms, threads=threads), TASK, space)
     robot = HiddenRobot(stage.world, truth, TASK, space, Noise(), seed)
     names = [p.name for p in stage.parameters]
-    outcome = loop(model, modifiers, robot, plan.settings, out, threads, dict(zip(names, truth, strict=True)))
+    outcome = loop(model, terms, robot, plan.settings, out, threads, dict(zip(names, truth, strict=True)))
     return {"truth": truth, **_of_loop(outcome, truth), **compare(stage, robot, outcome, out, seed)}
 
 

@@ -25,7 +25,6 @@ import numpy as np
 
 from benchmarks.btr_seeds import loop, study
 from benchmarks.paper_nao import V32
-from sysid_btr.btr.beginnings import model_fit
 from sysid_btr.btr.choice import get_choice, pool_of
 from sysid_btr.btr.controllers import Controller, NaoGait
 from sysid_btr.btr.loop import (
@@ -35,19 +34,20 @@ from sysid_btr.btr.loop import (
     controller_search,
     first_controller_search,
 )
+from sysid_btr.btr.map_problem import model_fit
 from sysid_btr.btr.problems import ControllerProblem, Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook
 from sysid_btr.btr.world import make_world
-from sysid_btr.effects.base import Effect
-from sysid_btr.effects.command_delay import CommandDelay
-from sysid_btr.effects.coulomb_friction import CoulombFriction
 from sysid_btr.estimators import Budget, CmaEs, Estimator, Journal, silent
-from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.robot import load_robot, servo_joints
-from sysid_btr.replay.engine import Numerics
-from sysid_btr.replay.log import set_parameters
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.log import set_parameters
+from sysid_btr.terms.command_delay import CommandDelay
+from sysid_btr.terms.coulomb_friction import CoulombFriction
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.grammar import parse_parameters
 
 TASK = Walk(8.0)
 FREE = (*(f"mass:{place}=shared" for place in V32), "kp:*=shared", "kv:*=shared")
@@ -108,9 +108,9 @@ def hidden_robot(seed: int, threads: int = 1) -> HiddenRobot:
     model = load_robot("nao")
     joints = servo_joints(model)
     friction = np.random.default_rng([seed, 1000]).uniform(*FRICTION, len(joints))
-    modifiers, values = set_parameters(model, {**{f"mass:{n}": f for n, f in V32.items()}, "kp:*=shared": GAIN})
-    modifiers = (*modifiers, CommandDelay(places=joints, shared=True), CoulombFriction(places=joints))
-    world = replace(make_world(model, TASK, modifiers, threads=threads), numerics=HIDDEN)
+    terms, values = set_parameters(model, {**{f"mass:{n}": f for n, f in V32.items()}, "kp:*=shared": GAIN})
+    terms = (*terms, CommandDelay(places=joints, shared=True), CoulombFriction(places=joints))
+    world = replace(make_world(model, TASK, terms, threads=threads), numerics=HIDDEN)
     return HiddenRobot(world, np.concatenate([values, [DELAY], friction]), TASK, NaoGait(), Noise(), seed)
 
 
@@ -118,15 +118,15 @@ def run_seed(seed: int, plan: Plan, out: Path, threads: int) -> dict[str, Any]:
     """One hidden Nao: the loop and what it is compared with."""
     cpu = process_time()
     model, robot = load_robot("nao"), hidden_robot(seed, threads)
-    modifiers = parse_parameters(list(FREE), model)
-    outcome = loop(model, modifiers, robot, plan.settings, out, threads)
+    terms = parse_parameters(list(FREE), model)
+    outcome = loop(model, terms, robot, plan.settings, out, threads)
     loop_s = process_time() - cpu
-    stage = Stage(make_world(model, TASK, modifiers, threads=threads), TASK, robot.space)
+    stage = Stage(make_world(model, TASK, terms, threads=threads), TASK, robot.space)
     return {**_of_loop(outcome, robot), **nominal_only(stage, robot, outcome, plan, out), "loop_cpu_s": loop_s}
 
 
 def _of_loop(outcome: BackToReality, robot: HiddenRobot) -> dict[str, Any]:
-    effects = [m for m in outcome.stage.world.modifiers if isinstance(m, Effect)]
+    effects = [m for m in outcome.stage.world.terms if isinstance(m, Effect)]
     model = dict(zip([p.name for p in outcome.parameters], outcome.model, strict=True))
     amounts = {e.name: [float(v) for n, v in model.items() if n.startswith(f"{e.name}:")] for e in effects}
     return {

@@ -12,10 +12,10 @@ from typing import Any
 from sysid_btr.btr.loop import BackToReality, Settings, back_to_reality
 from sysid_btr.btr.result import btr_result
 from sysid_btr.btr.robot import HiddenRobot
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot
 from sysid_btr.report.btr import draw_btr
 from sysid_btr.result import to_json
+from sysid_btr.terms.base import Term
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -70,7 +70,7 @@ def study(
 
 def loop(
     model: Robot,
-    modifiers: Sequence[Modifier],
+    terms: Sequence[Term],
     robot: HiddenRobot,
     settings: Settings,
     folder: Path,
@@ -81,7 +81,7 @@ def loop(
     cpu = process_time()
     outcome = back_to_reality(
         model,
-        modifiers,
+        terms,
         robot,
         robot.space,
         task=robot.task,

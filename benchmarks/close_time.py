@@ -1,6 +1,6 @@
 """`python -m benchmarks.close_time`: how long `close` takes on 40 s of 22 joints, by threads and by workers.
 
-Logs come from another rigid-body engine (`benchmarks.recorder`): one with an effect, one without, and four of 10 s with
+Logs come from another rigid-body engine (`reference_simulator`): one with an effect, one without, and four of 10 s with
 the effect. Rows are kept as they come, so that they can be measured one at a time; `--again` measures those anew that
 are there.
 """
@@ -19,23 +19,23 @@ from pathlib import Path
 from time import perf_counter, process_time, thread_time
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.recorder import Recording, save
-from benchmarks.recorder.effects import CoulombFriction
 from benchmarks.replay import HERE, ROOT, machine
-from sysid_btr.cluster.pool import DaskExecutor
+from reference_simulator import Recording, save
+from reference_simulator.effects import CoulombFriction
 from sysid_btr.diagnosis.close import close
+from sysid_btr.executors.base import HERE as IN_PROCESS
+from sysid_btr.executors.base import Executor
+from sysid_btr.executors.pool import DaskExecutor
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.robot import load_robot
-from sysid_btr.replay.executor import HERE as IN_PROCESS
-from sysid_btr.replay.executor import Executor
 from sysid_btr.request import DECLARED
 from sysid_btr.result import make_result
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
-    from sysid_btr.cluster.worker import Done
-    from sysid_btr.replay.executor import Divide, Work
+    from sysid_btr.executors.base import Divide, Work
+    from sysid_btr.executors.worker import Done
 
 MODEL = ROOT / "sample_logs" / "nao.xml"
 CLEAN = Recording(

@@ -33,15 +33,15 @@ import numpy as np
 
 from sysid_btr.estimators import Budget, CmaEs, Journal, silent
 from sysid_btr.io.log import Log, LogMeta
-from sysid_btr.models.grammar import parse_parameters
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot, load_robot
 from sysid_btr.objectives.distance import Distance, DistanceProblem, MeanSquare, Phi1, Phi2, Wasserstein
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import make_targets
-from sysid_btr.replay.engine import Numerics, Replay
-from sysid_btr.replay.log import set_parameters
 from sysid_btr.result import to_json
+from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.log import set_parameters
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.grammar import parse_parameters
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "distances.json"
@@ -95,7 +95,7 @@ class Hidden:
         return self.draw(0).uniform(*SPREAD, len(STARRED))
 
     @cached_property
-    def free(self) -> tuple[Modifier, ...]:
+    def free(self) -> tuple[Term, ...]:
         return parse_parameters(list(FREE), self.robot)
 
     @cached_property
@@ -106,14 +106,14 @@ class Hidden:
 
     def play(self, asked: Log) -> Log:
         """What the leg does when commands are played on it."""
-        modifiers, values = self.free, self.truth
+        terms, values = self.free, self.truth
         if self.condition == "masses":
             factors = self.draw(1).uniform(*SPREAD, len(OTHERS))
             wrong, others = set_parameters(
                 self.robot, {f"mass:{b}": float(f) for b, f in zip(OTHERS, factors, strict=True)}
             )
-            modifiers, values = (*modifiers, *wrong), np.concatenate([values, others])
-        return moved(Replay(self.robot, asked, modifiers, HIDDEN, threads=1), values)
+            terms, values = (*terms, *wrong), np.concatenate([values, others])
+        return moved(Replay(self.robot, asked, terms, HIDDEN, threads=1), values)
 
     @cached_property
     def logs(self) -> list[Log]:

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.blind.__main__ import named
 from benchmarks.blind.judge import Context, Judgement, judge
-from benchmarks.recorder.effects import Backlash, CommandDelay, CoulombFriction, Payload, SpeedTorqueLimit
+from reference_simulator.effects import Backlash, CommandDelay, CoulombFriction, Payload, SpeedTorqueLimit
 
 if TYPE_CHECKING:
-    from benchmarks.recorder.effects import Effect
+    from reference_simulator.effects import Effect
 
 FIT = ("mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared")
 SECONDS = 120.0
@@ -123,7 +123,7 @@ def data_folder() -> Path:
 
 def examine(folder: Path, letter: str, threads: int, out: Path | None) -> Outcome:
     """Close the loop on one recording."""
-    from benchmarks.recorder import load_robot as recorder_robot
+    from reference_simulator import load_robot as recorder_robot
     from sysid_btr.diagnosis.close import close
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log

@@ -29,15 +29,15 @@ from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.gait import Gait, gait
-from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.nao import PAPER_BOUNDS, STARRED
 from sysid_btr.models.robot import Robot, load_robot
 from sysid_btr.objectives.distance import Distance, DistanceProblem, MeanSquare, Phi2
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import make_targets
-from sysid_btr.replay.engine import Numerics, Replay
-from sysid_btr.replay.log import replay_log
 from sysid_btr.result import to_json
+from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.log import replay_log
+from sysid_btr.terms.grammar import parse_parameters
 
 RESULTS = Path(__file__).parent / "results"
 SAMPLES, PERIOD, STEPS = 4024, 0.055, 7
@@ -85,8 +85,8 @@ class Experiment:
     def problem(self) -> ReplayProblem:
         """Whole replays from the first sample, as in the paper."""
         robot = replace(load_robot("nao"), bounds=PAPER_BOUNDS)
-        modifiers = parse_parameters([f"mass:{','.join(STARRED)}"], robot)
-        run = Replay(robot, self.log, modifiers, NUMERICS, threads=self.threads)
+        terms = parse_parameters([f"mass:{','.join(STARRED)}"], robot)
+        run = Replay(robot, self.log, terms, NUMERICS, threads=self.threads)
         episode = Episode(run, make_targets(self.log, run.index.joints, ("position",)))
         return ReplayProblem((episode,), np.ones(len(run.parameters)))
 

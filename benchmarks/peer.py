@@ -3,7 +3,7 @@
 Needs `pip install "mujoco[sysid]"`. Both sides get RK4 at the replay's step, the same initial state, the mean of the
 held command over each step (given to the peer at its steps, where its interpolation returns it unchanged), and all
 cores. The peer minimises our whitened residual through its `modify_residual` hook, and its parameters are written into
-the spec by the cheapest possible modifiers, so its time holds nothing but its own way of working.
+the spec by the cheapest possible terms, so its time holds nothing but its own way of working.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.replay.engine import Numerics
+from sysid_btr.simulation.engine import Numerics
 
 PARAMETERS = {"arm": ("mass:*", "kp:*=shared", "kv:*=shared"), "masses": MASSES, "kp": ("kp:*",)}
 JOINTS = 6
@@ -167,14 +167,14 @@ def _peer_parameters(problem: ReplayProblem, spec: Any, plain: Any) -> Any:
     from mujoco import sysid
 
     params = sysid.ParameterDict()
-    for modifier in problem.modifiers:
-        write = {"mass": _write_mass, "kp": _write_kp, "kv": _write_kv}[modifier.name](spec, plain, modifier.places)
-        (p,) = modifier.parameters
+    for term in problem.terms:
+        write = {"mass": _write_mass, "kp": _write_kp, "kv": _write_kv}[term.name](spec, plain, term.places)
+        (p,) = term.parameters
 
         def modify(spec: Any, parameter: Any, write: Callable[[Any, float], None] = write) -> None:
             write(spec, parameter.value[0])
 
-        params.add(sysid.Parameter(p.name, p.nominal, p.lower, p.upper, modifier=modify))
+        params.add(sysid.Parameter(p.name, p.nominal, p.lower, p.upper, term=modify))
     return params
 
 

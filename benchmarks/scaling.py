@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks.replay import ROOT, SEED, machine, save
-from sysid_btr.effects.library import select_effects
 from sysid_btr.estimators import get_estimator
 from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
@@ -26,8 +25,9 @@ from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.robot import Robot, joint_names, load_robot, robot_from_spec, servo_joints
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.replay.engine import Numerics
-from sysid_btr.replay.log import replay_log
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.log import replay_log
+from sysid_btr.terms.library import select_effects
 
 NUMERICS = Numerics("implicitfast", 0.005)
 FINE = Numerics("RK4", 0.005)
@@ -132,8 +132,8 @@ def law(candidates: int) -> Job:
     """Replays with a friction that MuJoCo does not know: a step in Python for all candidates at once."""
     study = study_of(nao(), 2.0)
     (effect,) = [e for e in select_effects(["stribeck_friction"]) if e.overrides("law")][:1]
-    modifiers = (*study.declare(["kp:*=shared"]), effect.at(joint_names(nao())[:4], study.scales))
-    problem = study.train_problem(modifiers)
+    terms = (*study.declare(["kp:*=shared"]), effect.at(joint_names(nao())[:4], study.scales))
+    problem = study.train_problem(terms)
     middle = problem.start + 0.1 * np.minimum(problem.upper - problem.start, 5 * problem.scale)
     rows = np.tile(middle, (candidates, 1))
     problem.loss(rows[:1])

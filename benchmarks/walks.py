@@ -22,9 +22,9 @@ from typing import Any
 
 from benchmarks.gantry import data_folder
 from sysid_btr.diagnosis.close import close
+from sysid_btr.floating_base.walk import make_walk
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
-from sysid_btr.identify.walk import make_walk
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.robot import load_robot
 from sysid_btr.result import make_result, to_json
@@ -171,8 +171,8 @@ def together(folders: Folders) -> dict[str, Any]:
     gantry_c holds other masses than walk_a, so the hanging log is recorded with gantry_c's commands and walk_a's
     masses.
     """
-    from benchmarks.recorder import Recording, record
-    from benchmarks.recorder import load_robot as recorder_robot
+    from reference_simulator import Recording, record
+    from reference_simulator import load_robot as recorder_robot
 
     model = folders.data / "nao_gantry/nominal.xml"
     recorded = read_log(folders.data / "nao_gantry/gantry_c.parquet")

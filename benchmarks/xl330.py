@@ -27,7 +27,7 @@ from benchmarks.gantry import data_folder
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.study import Study
-    from sysid_btr.models.modifier import Modifier
+    from sysid_btr.terms.base import Term
 
 FOLDS = ("none", "kp100", "kp200", "kp400")
 DECLARED = ("torque_constant:pendulum",)
@@ -86,7 +86,7 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
     from sysid_btr.models.xl330 import xl330
-    from sysid_btr.replay.engine import Numerics
+    from sysid_btr.simulation.engine import Numerics
 
     began = perf_counter()
     logs = [read_log(path) for path in sorted(folder.glob("*.parquet"))]
@@ -132,37 +132,37 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def parameters(modifiers: Sequence[Modifier]) -> list[Any]:
-    return [p for m in modifiers for p in m.parameters]
+def parameters(terms: Sequence[Term]) -> list[Any]:
+    return [p for m in terms for p in m.parameters]
 
 
-def climb(found: Closing, study: Study) -> list[tuple[str, tuple[Modifier, ...], Any]]:
+def climb(found: Closing, study: Study) -> list[tuple[str, tuple[Term, ...], Any]]:
     """Least squares with the first effect, the first two, and so on, in the order in which they were found."""
     from sysid_btr.identify.refit import refit
 
     order = [label.split(" at ")[0] for step in found.steps for label in step.added]
-    declared = found.before_modifiers
+    declared = found.before_terms
     effects = sorted(
-        found.modifiers[len(declared) :],
+        found.terms[len(declared) :],
         key=lambda m: order.index(m.label or m.name) if (m.label or m.name) in order else len(order),
     )
     values_of, column = {}, 0
-    for modifier in found.modifiers:
-        values_of[modifier] = found.values[column : column + len(modifier.parameters)]
-        column += len(modifier.parameters)
+    for term in found.terms:
+        values_of[term] = found.values[column : column + len(term.parameters)]
+        column += len(term.parameters)
     result = []
     for count in range(len(effects) + 1):
-        modifiers = (*declared, *effects[:count])
-        start = np.concatenate([values_of[m] for m in modifiers])
-        fitted = refit(study, modifiers, start, iterations=20)
+        terms = (*declared, *effects[:count])
+        start = np.concatenate([values_of[m] for m in terms])
+        fitted = refit(study, terms, start, iterations=20)
         added = (effects[count - 1].label or effects[count - 1].name) if count else "torque constant alone"
-        result.append((added, modifiers, fitted.values))
+        result.append((added, terms, fitted.values))
     return result
 
 
-def errors(study: Study, modifiers: tuple[Modifier, ...], values: Any) -> list[float]:
+def errors(study: Study, terms: tuple[Term, ...], values: Any) -> list[float]:
     """Mean absolute position error of every log, rad."""
-    problem = study.train_problem(modifiers)
+    problem = study.train_problem(terms)
     result = []
     for episode in problem.episodes:
         outputs = episode.replay.predict(values[None])

@@ -23,7 +23,7 @@ from pdoc.render_helpers import to_html
 
 import sysid_btr
 import sysid_btr.posterior
-from sysid_btr.effects.library import EFFECTS
+from sysid_btr.terms.library import EFFECTS
 
 HERE = Path(__file__).parent
 TITLES = {

@@ -10,8 +10,8 @@ import shutil
 import sys
 from pathlib import Path
 
-from benchmarks.recorder import Recording, Sensors, parse_effect, save
-from benchmarks.recorder.robot import ROBOTS
+from reference_simulator import Recording, Sensors, parse_effect, save
+from reference_simulator.robot import ROBOTS
 
 HERE = Path(__file__).parent
 MODELS = {"leg.xml": ROBOTS / "six_joint_leg.xml", "pendulum.xml": ROBOTS / "pendulum.xml"}

@@ -13,8 +13,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sysid_btr.cluster import open_executor
     from sysid_btr.diagnosis.close import close
+    from sysid_btr.executors import open_executor
     from sysid_btr.identify.fit import fit
     from sysid_btr.identify.study import make_study
     from sysid_btr.importing import import_log
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from sysid_btr.io.validation import validate_file, validate_log
     from sysid_btr.models.robot import load_robot
     from sysid_btr.posterior import posterior
-    from sysid_btr.replay.log import replay_log
     from sysid_btr.result import read_result
     from sysid_btr.session import save
+    from sysid_btr.simulation.log import replay_log
 
 __version__ = "0.1.0"
 
@@ -34,11 +34,11 @@ _HOME = {
     "import_log": "sysid_btr.importing",
     "load_robot": "sysid_btr.models.robot",
     "make_study": "sysid_btr.identify.study",
-    "open_executor": "sysid_btr.cluster",
+    "open_executor": "sysid_btr.executors",
     "posterior": "sysid_btr.posterior",
     "read_log": "sysid_btr.io.parquet",
     "read_result": "sysid_btr.result",
-    "replay_log": "sysid_btr.replay.log",
+    "replay_log": "sysid_btr.simulation.log",
     "save": "sysid_btr.session",
     "validate_file": "sysid_btr.io.validation",
     "validate_log": "sysid_btr.io.validation",

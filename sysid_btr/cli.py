@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
     from sysid_btr.io.log import Log
-    from sysid_btr.models.modifier import Modifier
     from sysid_btr.models.robot import Robot
     from sysid_btr.posterior.draw import Posterior
-    from sysid_btr.replay.engine import Numerics
+    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.terms.base import Term
 
     Job = Callable[[Study, ProgressLine], Fit | Closing | Posterior]
 
@@ -468,27 +468,27 @@ def replay(
     from sysid_btr.identify.scores import score_problem
     from sysid_btr.identify.study import make_study
     from sysid_btr.objectives.targets import COMPARED
-    from sysid_btr.replay.log import replay_log, set_parameters
     from sysid_btr.result import replay_result
+    from sysid_btr.simulation.log import replay_log, set_parameters
 
     began = time.perf_counter()
     robot = find_robot(model, None)
     logs = read_logs(log, motions=True)
     parameters = dict(assignments("--set", set_))
-    modifiers, values = set_parameters(robot, parameters)
+    terms, values = set_parameters(robot, parameters)
     numerics = None
     if params is not None:
-        modifiers, values, numerics = with_params(params, robot, modifiers, values)
+        terms, values, numerics = with_params(params, robot, terms, values)
     targets = replay_targets(out, logs, overwrite)
     if any(one.is_motion for one in logs):
-        _rehearse(robot, logs, (modifiers, values), numerics, targets, overwrite, threads, as_json)
+        _rehearse(robot, logs, (terms, values), numerics, targets, overwrite, threads, as_json)
         return
     study = make_study(robot, logs, holdout=logs, channels=COMPARED, numerics=numerics, threads=threads)
-    scores = score_problem(study.train_problem(modifiers), values)
+    scores = score_problem(study.train_problem(terms), values)
     for path, one in zip(targets, logs, strict=False):
         from sysid_btr.io.parquet import write_log
 
-        predicted = replay_log(robot, one, (modifiers, values), numerics=study.numerics, threads=threads)
+        predicted = replay_log(robot, one, (terms, values), numerics=study.numerics, threads=threads)
         write_log(predicted, path, overwrite=overwrite)
     result = replay_result(study, scores, parameters, time.perf_counter() - began)
     if as_json:
@@ -564,9 +564,9 @@ def fit(
     _check_render(render, keeper)
 
     def job(study: Study, progress: ProgressLine) -> Fit:
-        modifiers = study.declare(free)
-        wanted = chosen_names([p.name for m in modifiers for p in m.parameters], profile or [])
-        return with_profiles(search(study, modifiers, _generator(seed), keeper.journal, progress), wanted, progress)
+        terms = study.declare(free)
+        wanted = chosen_names([p.name for m in terms for p in m.parameters], profile or [])
+        return with_profiles(search(study, terms, _generator(seed), keeper.journal, progress), wanted, progress)
 
     _finish(request, keeper, job, as_json, render)
 
@@ -652,13 +652,13 @@ def posterior(
     _check_render(render, keeper)
 
     def job(study: Study, progress: ProgressLine) -> Posterior:
-        modifiers = study.declare(free)
-        parameters = [p for m in modifiers for p in m.parameters]
+        terms = study.declare(free)
+        parameters = [p for m in terms for p in m.parameters]
         choose_priors(parameters, believed, robot.priors)
         walkers_for(len(parameters), walkers)
         rng = _generator(seed)
         return draw_posterior(
-            search(study, modifiers, rng, keeper.journal, progress),
+            search(study, terms, rng, keeper.journal, progress),
             priors=believed,
             settings=settings,
             rng=rng,
@@ -703,7 +703,7 @@ def close(
     Without --fit all masses and the common servo gains are freed, so that a wrong mass does not pass for an
     effect.
     """
-    from sysid_btr.effects.library import select_effects
+    from sysid_btr.terms.library import select_effects
 
     robot = find_robot(model, bounds)
     names = split_names(effects) or ["all"]
@@ -1007,7 +1007,7 @@ def _search(
     robot: Robot,
     start: list[str] | None,
     params: Path | None,
-) -> Callable[[Study, Sequence[Modifier], Any, Journal, ProgressLine], Fit]:
+) -> Callable[[Study, Sequence[Term], Any, Journal, ProgressLine], Fit]:
     """A fit as the flags ask for it, of whatever study."""
     from sysid_btr.estimators import get_estimator
     from sysid_btr.estimators.base import Budget
@@ -1017,12 +1017,12 @@ def _search(
     chosen, wanted = get_estimator(estimator), get_distance(distance)
 
     def search(
-        study: Study, modifiers: Sequence[Modifier], rng: Any, journal: Journal, progress: ProgressLine
+        study: Study, terms: Sequence[Term], rng: Any, journal: Journal, progress: ProgressLine
     ) -> Fit:
-        parameters = [p for m in modifiers for p in m.parameters]
+        parameters = [p for m in terms for p in m.parameters]
         return fit_study(
             study,
-            modifiers,
+            terms,
             estimator=chosen,
             rng=rng,
             budget=Budget(evaluations=max_evaluations),
@@ -1041,11 +1041,11 @@ def _closing_job(
     def job(study: Study, progress: ProgressLine) -> Closing:
         from sysid_btr.diagnosis.close import close as close_loop
 
-        modifiers = study.declare(parameters)
-        free = [p for m in modifiers for p in m.parameters]
+        terms = study.declare(parameters)
+        free = [p for m in terms for p in m.parameters]
         return close_loop(
             study,
-            modifiers,
+            terms,
             start=start_values(free, known_starts(params, study.robot, free)),
             effects=tuple(effects),
             rng=_generator(seed),
@@ -1059,7 +1059,7 @@ def _closing_job(
 def _rehearse(
     robot: Robot,
     motions: Sequence[Log],
-    chosen: tuple[tuple[Modifier, ...], FloatArray],
+    chosen: tuple[tuple[Term, ...], FloatArray],
     numerics: Numerics | None,
     targets: Sequence[Path],
     overwrite: bool,
@@ -1070,9 +1070,9 @@ def _rehearse(
     from itertools import zip_longest
 
     from sysid_btr.io.parquet import write_log
-    from sysid_btr.replay.log import replay_log
     from sysid_btr.report.motion import reach, reach_table
     from sysid_btr.report.text import console
+    from sysid_btr.simulation.log import replay_log
 
     if not all(one.is_motion for one in motions):
         raise UsageError("--log: motions to be played and recordings; give one or the other")
@@ -1122,7 +1122,7 @@ def _finish(request: Request, keeper: Keeper, job: Job, as_json: bool, render: b
 
 def _run(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool = False) -> int:
     """Do the work, write and print what it found; the exit code."""
-    from sysid_btr.cluster import open_executor
+    from sysid_btr.executors import open_executor
     from sysid_btr.result import exit_code, make_result
     from sysid_btr.writeback.write import describe_model
 

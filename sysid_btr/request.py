@@ -16,13 +16,13 @@ from sysid_btr.session import Folder, open_folder
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.estimators.journal import Journal
+    from sysid_btr.executors.base import Executor
     from sysid_btr.identify.study import Study
     from sysid_btr.io.importers.run import KnownModel
     from sysid_btr.io.log import Log
-    from sysid_btr.models.modifier import Modifier, Parameter
     from sysid_btr.models.robot import Robot
-    from sysid_btr.replay.engine import Numerics
-    from sysid_btr.replay.executor import Executor
+    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.terms.base import Parameter, Term
 
 DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
 """What `close` frees where nothing is said: a wrong mass or gain must not pass for an effect."""
@@ -195,8 +195,8 @@ def declared(robot: Robot, free: list[str] | None) -> list[str]:
 
 def what_can_be_freed(robot: Robot) -> str:
     """Every field of the grammar with the names it can be freed at, for those who gave none."""
-    from sysid_btr.models.fields import FIELDS
     from sysid_btr.models.robot import body_names, joint_names, servo_joints
+    from sysid_btr.terms.fields import FIELDS
 
     fields: dict[str, list[str]] = {}
     for name, cls in {**FIELDS, **robot.fields}.items():
@@ -271,19 +271,19 @@ def known_starts(path: Path | None, robot: Robot, parameters: Sequence[Parameter
 
 
 def with_params(
-    path: Path, robot: Robot, modifiers: Sequence[Modifier], values: FloatArray
-) -> tuple[tuple[Modifier, ...], FloatArray, Numerics]:
-    """A model of an earlier run, further changed by modifiers with their values; and its numerics."""
+    path: Path, robot: Robot, terms: Sequence[Term], values: FloatArray
+) -> tuple[tuple[Term, ...], FloatArray, Numerics]:
+    """A model of an earlier run, further changed by terms with their values; and its numerics."""
     import numpy as np
 
     from sysid_btr.writeback.params import read_params
 
     params = read_params(path, robot)
-    taken = {(m.name, place) for m in params.modifiers for place in m.places}
-    twice = [f"{m.name}:{place}" for m in modifiers for place in m.places if (m.name, place) in taken]
+    taken = {(m.name, place) for m in params.terms for place in m.places}
+    twice = [f"{m.name}:{place}" for m in terms for place in m.places if (m.name, place) in taken]
     if twice:
         raise UsageError(f"given by --set and by --params: {', '.join(twice)}; give one of the two")
-    return (*params.modifiers, *modifiers), np.concatenate([params.values, values]), params.numerics
+    return (*params.terms, *terms), np.concatenate([params.values, values]), params.numerics
 
 
 def assignments(flag: str, given: list[str] | None) -> list[tuple[str, float]]:
@@ -319,7 +319,7 @@ def bounds_table(given: list[str] | None) -> list[tuple[str, tuple[float, float]
 
 def _check_names(robot: Robot, bounds: Iterable[str]) -> None:
     """Refuse bounds of what no parameter of the robot is called."""
-    from sysid_btr.models.grammar import check_expression
+    from sysid_btr.terms.grammar import check_expression
 
     problems = []
     for name in bounds:

@@ -95,7 +95,7 @@ def _provenance(study: Study) -> dict[str, Any]:
 
 def _walks(study: Study) -> list[dict[str, Any]]:
     """How each log of a free base was cut up, and what its base state lacks."""
-    from sysid_btr.identify.walk import Walk
+    from sysid_btr.floating_base.walk import Walk
 
     return [
         {

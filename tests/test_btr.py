@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid_btr.btr.beginnings import Beginnings, model_fit
 from sysid_btr.btr.choice import Pool, disagreement, fittest, pool_of
 from sysid_btr.btr.closing import _tell_apart, join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
 from sysid_btr.btr.loop import BackToReality, Iteration, Settings, back_to_reality, disengaged
+from sysid_btr.btr.map_problem import Beginnings, model_fit
 from sysid_btr.btr.problems import ControllerProblem, ModelProblem, Stage
 from sysid_btr.btr.result import btr_result, estimate_model
 from sysid_btr.btr.robot import SILENT, HiddenRobot, Noise, Robot, Trial
@@ -25,8 +25,6 @@ from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.cli import run
-from sysid_btr.effects.base import Effect
-from sysid_btr.effects.command_delay import CommandDelay
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators import CmaEs, GeneticAlgorithm, Record
 from sysid_btr.identify.refit import judge
@@ -36,12 +34,14 @@ from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.validation import validate_log
 from sysid_btr.models import ant as ant_module
 from sysid_btr.models.ant import SegmentLength
-from sysid_btr.models.grammar import parse_parameters
-from sysid_btr.models.modifier import Modifier, Rig
 from sysid_btr.models.robot import load_robot
-from sysid_btr.replay.engine import Replay, make_index
 from sysid_btr.report.btr import draw_btr
 from sysid_btr.result import to_json
+from sysid_btr.simulation.engine import Replay, make_index
+from sysid_btr.terms.base import Rig, Term
+from sysid_btr.terms.command_delay import CommandDelay
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.grammar import parse_parameters
 
 MODEL = load_robot("ant")
 TASK = Walk(1.0)
@@ -50,16 +50,16 @@ FREE = ["length:LFFemur,RFTibia"]
 TRUTH = np.array([1.25, 0.8])
 
 
-def modifiers() -> tuple[Modifier, ...]:
+def terms() -> tuple[Term, ...]:
     return parse_parameters(FREE, MODEL)
 
 
 def stage(task: Walk = TASK) -> Stage:
-    return Stage(make_world(MODEL, task, modifiers(), threads=1), task, SPACE)
+    return Stage(make_world(MODEL, task, terms(), threads=1), task, SPACE)
 
 
 def hidden(noise: Noise = Noise()) -> HiddenRobot:  # noqa: B008
-    return HiddenRobot(make_world(MODEL, TASK, modifiers(), threads=1), TRUTH, TASK, SPACE, noise)
+    return HiddenRobot(make_world(MODEL, TASK, terms(), threads=1), TRUTH, TASK, SPACE, noise)
 
 
 def some_controllers(count: int, seed: int = 0) -> np.ndarray:
@@ -79,7 +79,7 @@ TINY = Settings(
 def tiny(robot: Robot, folder: Path | None = None, settings: Settings = TINY, **more: object) -> BackToReality:
     return back_to_reality(
         MODEL,
-        modifiers(),
+        terms(),
         robot,
         SPACE,
         task=TASK,
@@ -131,12 +131,12 @@ def test_the_ant_has_six_legs_eighteen_servos_and_stands() -> None:
 def test_a_length_written_into_fields_is_the_model_that_a_compiler_makes(monkeypatch: pytest.MonkeyPatch) -> None:
     from mujoco.batch import Batch
 
-    modifier = SegmentLength(places=("LFFemur", "RMTibia"))
+    term = SegmentLength(places=("LFFemur", "RMTibia"))
     spec = MODEL.make_spec()
-    modifier.edit_spec(spec)
+    term.edit_spec(spec)
     model = spec.compile()
     batch = Batch(model, 1, 1)
-    modifier.write_fields(Rig(model, batch, make_index(model), 0.005), np.array([[[1.3], [0.8]]]))
+    term.write_fields(Rig(model, batch, make_index(model), 0.005), np.array([[[1.3], [0.8]]]))
     batch.set_const()
     written = batch.get_model(0)
     femur, tibia, add_leg = ant_module.FEMUR, ant_module.TIBIA, ant_module._add_leg
@@ -343,7 +343,7 @@ def test_what_trials_do_not_tell_stays_as_it_was() -> None:
     log = hidden().run(Controller(controller)).log
     assert log is not None
     unseen = parse_parameters(["damping:LFCoxa"], MODEL)[0]
-    free = (*modifiers(), replace(unseen, places=("LFCoxa",)))
+    free = (*terms(), replace(unseen, places=("LFCoxa",)))
     start = np.array([1.1, 0.9, nominal_start(free)[2]])
     problem = Beginnings(trial_study(stage(), [log], [], 1).train_problem(free, start))
     candidates = np.vstack([start, start + problem.width])
@@ -444,7 +444,7 @@ def test_a_run_may_disagree_or_correct_linearly() -> None:
 
 @pytest.mark.parametrize("disk", [True, False])
 def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    declared = modifiers()
+    declared = terms()
     delay = CommandDelay(places=tuple(SPACE.joints), shared=True)
     asked: list[int] = []
 
@@ -481,11 +481,11 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
 def test_a_trial_is_replayed_as_it_was_made() -> None:
     log = hidden(SILENT).run(Controller(some_controllers(1)[0])).log
     assert log is not None
-    problem = trial_study(stage(), [log], [log], 1).train_problem(modifiers(), np.ones(2))
+    problem = trial_study(stage(), [log], [log], 1).train_problem(terms(), np.ones(2))
     ((_, outputs),) = problem.episodes[0].replay.chunks(TRUTH[None])
     assert np.array_equal(problem.episodes[0].targets[0].predicted(outputs)[0], problem.episodes[0].targets[0].measured)
     # the part that a shorter log has, and trials together
-    half = trial_study(stage(), [log.window(0, 26), log], [log], 1).train_problem(modifiers(), np.ones(2))
+    half = trial_study(stage(), [log.window(0, 26), log], [log], 1).train_problem(terms(), np.ones(2))
     assert half.residuals(TRUTH[None]).shape == (1, (26 + 51) * 18)
     assert np.abs(half.residuals(TRUTH[None])).max() == 0
 
@@ -507,11 +507,11 @@ def test_a_model_that_spoils_the_whole_trials_is_not_taken(monkeypatch: pytest.M
 
 def test_effects_are_found_in_trials_of_a_robot_that_stands_on_its_own() -> None:
     delay = CommandDelay(places=tuple(SPACE.joints), shared=True)
-    world = make_world(MODEL, TASK, (*modifiers(), delay), threads=1)
+    world = make_world(MODEL, TASK, (*terms(), delay), threads=1)
     late = HiddenRobot(world, np.array([*TRUTH, 0.03]), TASK, SPACE, Noise())
     tried = [Tried(1, Controller(c), 0.0, late.run(Controller(c))) for c in 0.5 * some_controllers(2)]
     joined = join_effects(stage(), np.ones(2), tried, None, 1)
-    named = [m for m in joined.modifiers if isinstance(m, Effect)]
+    named = [m for m in joined.terms if isinstance(m, Effect)]
     assert [m.name for m in named] in (["command_delay"], ["sensor_delay"])
     assert abs(joined.values[-1] - 0.03) < 0.002
     assert np.all(np.abs(joined.values[:2] - TRUTH) < np.abs(1 - TRUTH))
@@ -522,15 +522,15 @@ def test_effects_are_found_in_trials_of_a_robot_that_stands_on_its_own() -> None
 def test_an_effect_has_amounts_of_its_own_where_held_out_trials_want_that(apart: bool) -> None:
     places = tuple(SPACE.joints)
     delays = np.where([apart and j.startswith("R") for j in places], 0.04, 0.02)
-    world = make_world(MODEL, TASK, (*modifiers(), CommandDelay(places=places)), threads=1)
+    world = make_world(MODEL, TASK, (*terms(), CommandDelay(places=places)), threads=1)
     late = HiddenRobot(world, np.array([*TRUTH, *delays]), TASK, SPACE, Noise())
     logs = [late.run(Controller(c)).log for c in 0.4 * some_controllers(4)]
     assert all(log is not None for log in logs)
     study = trial_study(stage(), [log for log in logs[:2] if log], [log for log in logs[2:] if log], 1)
     shared = CommandDelay(places=places, shared=True)
-    lengths = [(m, (float(v),)) for m, v in zip(modifiers(), TRUTH, strict=True)]
+    lengths = [(m, (float(v),)) for m, v in zip(terms(), TRUTH, strict=True)]
     alike = [*lengths, (shared, (float(delays.mean()),))]
-    left = judge(study, (*modifiers(), shared), np.array([*TRUTH, delays.mean()])).holdout
+    left = judge(study, (*terms(), shared), np.array([*TRUTH, delays.mean()])).holdout
     found, holdout, spent = _tell_apart(study, alike, len(lengths), left)
     assert spent > 1
     assert found[-1][0].shared is not apart
@@ -541,7 +541,7 @@ def test_an_effect_has_amounts_of_its_own_where_held_out_trials_want_that(apart:
         assert (holdout, found) == (left, alike)
 
 
-def params_entry(found: Sequence[Modifier], values: np.ndarray) -> dict[str, object]:
+def params_entry(found: Sequence[Term], values: np.ndarray) -> dict[str, object]:
     entries, column = [], 0
     for m in found:
         own = values[column : column + len(m.parameters)]

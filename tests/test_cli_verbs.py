@@ -21,9 +21,9 @@ from sysid_btr.demo import cases
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.models.robot import load_robot
-from sysid_btr.replay.engine import Numerics
-from sysid_btr.replay.log import replay_log
 from sysid_btr.result import read_result
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.log import replay_log
 
 MASS, KP, FRICTION = 1.2, 0.9, 0.1
 PENDULUM = """

@@ -17,32 +17,32 @@ from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.scan import Question, Trace, where_something_is
-from sysid_btr.effects.armature import Armature
-from sysid_btr.effects.backlash import Backlash
-from sysid_btr.effects.base import Effect
-from sysid_btr.effects.com_offset import ComOffset
-from sysid_btr.effects.command_delay import CommandDelay
-from sysid_btr.effects.constant_force import ConstantForce
-from sysid_btr.effects.coulomb_friction import CoulombFriction
-from sysid_btr.effects.encoder_offset import EncoderOffset
-from sysid_btr.effects.gravity_tilt import GravityTilt
-from sysid_btr.effects.integral_gain import IntegralGain
-from sysid_btr.effects.joint_compliance import JointCompliance
-from sysid_btr.effects.joint_spring import JointSpring
-from sysid_btr.effects.payload import Payload
-from sysid_btr.effects.quadratic_damping import QuadraticDamping
-from sysid_btr.effects.sensor_delay import SensorDelay
-from sysid_btr.effects.slew_limit import SlewLimit
-from sysid_btr.effects.speed_torque_limit import SpeedTorqueLimit
-from sysid_btr.effects.torque_limit import TorqueLimit
-from sysid_btr.effects.viscous_damping import ViscousDamping
 from sysid_btr.estimators import Journal
 from sysid_btr.identify.refit import judge
 from sysid_btr.identify.study import make_study, nominal_start
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.robot import load_robot
-from sysid_btr.replay.engine import Numerics
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.terms.armature import Armature
+from sysid_btr.terms.backlash import Backlash
+from sysid_btr.terms.com_offset import ComOffset
+from sysid_btr.terms.command_delay import CommandDelay
+from sysid_btr.terms.constant_force import ConstantForce
+from sysid_btr.terms.coulomb_friction import CoulombFriction
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.encoder_offset import EncoderOffset
+from sysid_btr.terms.gravity_tilt import GravityTilt
+from sysid_btr.terms.integral_gain import IntegralGain
+from sysid_btr.terms.joint_compliance import JointCompliance
+from sysid_btr.terms.joint_spring import JointSpring
+from sysid_btr.terms.payload import Payload
+from sysid_btr.terms.quadratic_damping import QuadraticDamping
+from sysid_btr.terms.sensor_delay import SensorDelay
+from sysid_btr.terms.slew_limit import SlewLimit
+from sysid_btr.terms.speed_torque_limit import SpeedTorqueLimit
+from sysid_btr.terms.torque_limit import TorqueLimit
+from sysid_btr.terms.viscous_damping import ViscousDamping
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 GAINS = ("kp:*=shared", "kv:*=shared")
@@ -152,7 +152,7 @@ def test_what_others_can_only_imitate_is_not_given_their_name(
 ) -> None:
     """A gait repeats itself, so that a spring may stand for a cable, and a push for a servo that lets go."""
     pytest.importorskip("pinocchio", reason="the recorder needs Pinocchio (pip install pin)")
-    from benchmarks.recorder import Recording, parse_effect, record
+    from reference_simulator import Recording, parse_effect, record
 
     model = str(SAMPLES / "leg.xml")
     recording = Recording(model, motion=motion, seed=seed, seconds=12, effects=(parse_effect(effect),))
@@ -183,7 +183,7 @@ def test_every_step_and_candidate_is_recorded(name: str) -> None:
     found = sample(name)
     assert found.steps[0].added == ()
     assert found.replays > 0
-    assert len(found.values) == sum(len(m.parameters) for m in found.modifiers)
+    assert len(found.values) == sum(len(m.parameters) for m in found.terms)
     if found.effects:
         assert any(c.effect == found.effects[0].effect for c in found.candidates)
         assert found.steps[-1].holdout < found.steps[0].holdout
@@ -407,7 +407,7 @@ def test_a_hypothesis_that_is_too_fast_for_the_step_is_tried_with_a_shorter_one(
     declared = coarse.declare(TOY_FIT)
     plain = judge(coarse, declared, nominal_start(declared))
     soft = Hypothesis(JointCompliance, ("ankle",), False, np.array([0.003]), 0.0)
-    diverging = judge(coarse, (*declared, soft.modifier(coarse.scales)), np.append(plain.values, soft.start))
+    diverging = judge(coarse, (*declared, soft.term(coarse.scales)), np.append(plain.values, soft.start))
     assert np.isfinite(plain.holdout)
     assert np.isnan(diverging.holdout)
     found = closing._try(coarse, closing._State(plain, ()), soft)

@@ -15,26 +15,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis import patterns
+from sysid_btr.diagnosis import signal_features
 from sysid_btr.diagnosis.scan import Question
 from sysid_btr.diagnosis.signature import proposals, signature
 from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
-from sysid_btr.effects.base import Effect
-from sysid_btr.effects.cogging import Cogging
-from sysid_btr.effects.coulomb_friction import CoulombFriction
-from sysid_btr.effects.external_disturbance import (
-    DriveDisturbanceTrain,
-    ExternalDisturbance,
-    ExternalDisturbanceTrain,
-    pulses,
-)
-from sysid_btr.effects.library import EFFECTS
 from sysid_btr.identify.refit import refit
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.emps import emps
 from sysid_btr.models.robot import load_robot
+from sysid_btr.terms.cogging import Cogging
+from sysid_btr.terms.coulomb_friction import CoulombFriction
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.external_disturbance import (
+    DriveDisturbanceTrain,
+    ExternalDisturbance,
+    ExternalDisturbanceTrain,
+    pulses,
+)
+from sysid_btr.terms.library import EFFECTS
 
 NOISE = 4e-4
 """rad, of a position sensor."""
@@ -57,8 +57,8 @@ def leg_log(
         time = log.time + np.append(0.0, rng.uniform(-0.3, 0.3, len(log.time) - 1) * 0.01)
         log = replace(log, time=time)
     scales = dict.fromkeys(toys.LEG_JOINTS, toys.SCALE)
-    modifiers = () if effect is None else (effect.at((place,), scales),)
-    outputs = toys.run(toys.leg(), log, modifiers, np.array(values), effort=True)
+    terms = () if effect is None else (effect.at((place,), scales),)
+    outputs = toys.run(toys.leg(), log, terms, np.array(values), effort=True)
     channels = dict(log.channels)
     for i, joint in enumerate(toys.LEG_JOINTS):
         channels[f"position.{joint}"] = outputs.position[0, :, i] + rng.normal(0, NOISE, len(log.time))
@@ -280,12 +280,12 @@ LEG = str(Path(__file__).resolve().parents[1] / "sample_logs" / "leg.xml")
 def unexplained(effect: str) -> dict[str, Any]:
     """Signature of something that is in no library, in a log from another engine."""
     pytest.importorskip("pinocchio", reason="the recorder needs Pinocchio (pip install pin)")
-    from benchmarks.recorder import Recording, parse_effect, record
+    from reference_simulator import Recording, parse_effect, record
 
     spec = Recording(LEG, seed=3, seconds=16, mass={"KneePitch": 1.1}, effects=(parse_effect(effect),))
     study = make_study(load_robot(LEG), [record(spec)[0]], holdout=0.1)
-    modifiers = study.declare(["mass:*Knee*", "kp:*=shared"])
-    return signature(study, modifiers, refit(study, modifiers, np.ones(2)).values)
+    terms = study.declare(["mass:*Knee*", "kp:*=shared"])
+    return signature(study, terms, refit(study, terms, np.ones(2)).values)
 
 
 @pytest.mark.parametrize(
@@ -311,8 +311,8 @@ def test_what_is_in_no_library_is_described_as_what_it_is(effect: str, best: str
 
 def test_the_recorded_dropout_is_periodic_with_its_period() -> None:
     study = make_study(load_robot(LEG), [read_log(Path(LEG).with_name("leg_dropout.parquet"))])
-    modifiers = study.declare(["mass:*Knee*", "kp:*=shared"])
-    found = signature(study, modifiers, refit(study, modifiers, np.ones(2)).values)
+    terms = study.declare(["mass:*Knee*", "kp:*=shared"])
+    found = signature(study, terms, refit(study, terms, np.ones(2)).values)
     knee = found["joints"][0]
     assert (knee["joint"], knee["best"]) == ("KneePitch", "torque_and_phase")
     assert knee["periodic"]["period"] == pytest.approx(1.7, abs=0.01)
@@ -321,14 +321,14 @@ def test_the_recorded_dropout_is_periodic_with_its_period() -> None:
 def test_the_measured_pulses_of_emps_are_found(shared_data: Path) -> None:
     log = read_log(shared_data / "emps" / "emps_pulses.parquet").window(0, 9001)
     study = make_study(emps(), [log], holdout=0.1)
-    modifiers = study.declare(["mass:*", "damping:*", "frictionloss:*", "constant_force:*"])
+    terms = study.declare(["mass:*", "damping:*", "frictionloss:*", "constant_force:*"])
     values = np.array([1.0, 203.5, 20.4, 3.16])
-    problem = study.train_problem(modifiers, values)
+    problem = study.train_problem(terms, values)
     residual = problem.residuals(values[None])[0]
     found = proposals(study, problem, values, residual, (ExternalDisturbanceTrain, DriveDisturbanceTrain))
     assert [q.effect for q in found] == [ExternalDisturbanceTrain, DriveDisturbanceTrain]
     assert found[0].probe[0][1:] == pytest.approx((0.344, 0.5, 1.0), abs=0.004)
-    (slider,) = signature(study, modifiers, values)["joints"]
+    (slider,) = signature(study, terms, values)["joints"]
     assert slider["periodic"]["amplitude"] == pytest.approx(178, rel=0.03)
     assert slider["best"] == "phase"
 
@@ -342,14 +342,15 @@ def noise(n: int, seed: int = 0) -> FloatArray:
 
 def test_states_that_have_nothing_to_do_with_a_signal_predict_nothing_of_it() -> None:
     state = np.cumsum(noise(2000, 1))
-    many = patterns.hats(state, patterns.even_knots(state, 30))
-    assert abs(patterns.predicted_share(noise(2000), many, 50)) < 0.05
+    many = signal_features.hats(state, signal_features.even_knots(state, 30))
+    assert abs(signal_features.predicted_share(noise(2000), many, 50)) < 0.05
 
 
 def test_a_state_predicts_what_it_causes() -> None:
     state = np.sin(0.01 * np.arange(2000)) + 0.3 * np.sin(0.037 * np.arange(2000))
     signal = state**2 + 0.1 * noise(2000)
-    assert patterns.predicted_share(signal, patterns.hats(state, patterns.even_knots(state, 12)), 50) > 0.9
+    hats = signal_features.hats(state, signal_features.even_knots(state, 12))
+    assert signal_features.predicted_share(signal, hats, 50) > 0.9
 
 
 @settings(max_examples=25, deadline=None)
@@ -357,7 +358,7 @@ def test_a_state_predicts_what_it_causes() -> None:
 def test_a_pulse_is_found_in_noise(start: int, length: int, seed: int) -> None:
     signal = noise(1000, seed)
     signal[start : start + length] += 5.0
-    box = patterns.best_box(signal, 2)
+    box = signal_features.best_box(signal, 2)
     assert box is not None
     assert abs(box.start - start) <= 2
     assert abs(box.stop - start - length) <= 2
@@ -368,12 +369,12 @@ def test_a_pulse_is_found_in_noise(start: int, length: int, seed: int) -> None:
 def test_a_period_is_found_and_not_its_multiple(period: float, phase: float, seed: int) -> None:
     time = 0.01 * np.arange(1400)
     on = np.mod(time / period - phase, 1.0) < 0.25
-    found, share = patterns.best_period(on + 0.2 * noise(1400, seed), time, 0.3)
+    found, share = signal_features.best_period(on + 0.2 * noise(1400, seed), time, 0.3)
     assert found == pytest.approx(period, rel=0.01)
     assert share > 0.5
 
 
 def test_noise_has_no_period_and_no_memory() -> None:
     time = 0.01 * np.arange(1400)
-    assert patterns.best_period(noise(1400), time, 0.3)[1] < 0.15
-    assert patterns.memory(noise(5000)) == pytest.approx(1.0, abs=0.3)
+    assert signal_features.best_period(noise(1400), time, 0.3)[1] < 0.15
+    assert signal_features.memory(noise(5000)) == pytest.approx(1.0, abs=0.3)

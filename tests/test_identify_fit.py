@@ -22,10 +22,10 @@ from sysid_btr.identify.intervals import Estimate, covariance, estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.modifier import Parameter
 from sysid_btr.models.robot import Robot, load_robot
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.replay.engine import Numerics
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.terms.base import Parameter
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 GAINS = ("kp:*=shared", "kv:*=shared")
@@ -62,7 +62,7 @@ TWO_LIMBS = """
 
 def measured(robot: Robot, log: Log, scales: Mapping[str, float] | None = None, seed: int = 0) -> Log:
     """The log with positions of a robot whose parameters differ, through a 12-bit encoder with noise."""
-    from sysid_btr.replay.log import replay_log
+    from sysid_btr.simulation.log import replay_log
 
     run = replay_log(robot, log, scales or {}, numerics=Numerics("RK4", 0.00125))
     rng = np.random.default_rng(seed)
@@ -310,8 +310,8 @@ def test_coloured_jacobian_is_that_of_plain_differences() -> None:
     robot = toys.robot_from_xml(TWO_LIMBS, "two")
     log = measured(robot, toys.swing(("left", "left_end", "right"), seconds=2.0), {"kp:*": 0.9})
     study = make_study(robot, [log], numerics=QUICK)
-    modifiers = study.declare(["mass:left,right,left_end", "kp:left,right", "kv:*=shared"])
-    problem = study.train_problem(modifiers)
+    terms = study.declare(["mass:left,right,left_end", "kp:left,right", "kv:*=shared"])
+    problem = study.train_problem(terms)
     names = problem.names
     grouped = [tuple(names[i] for i in g) for g in problem.groups]
     assert sorted(i for g in problem.groups for i in g) == list(range(len(names)))

@@ -14,12 +14,12 @@ from sysid_btr.errors import LogError, ModelError
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.emps import emps
-from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.nao import FEET, STARRED, nao, nao_table1
 from sysid_btr.models.robot import Robot, joint_names, joint_ranges, load_robot, servo_joints
 from sysid_btr.models.xl330 import TORQUE_PER_VOLT, xl330
-from sysid_btr.replay.engine import Numerics, Replay
-from sysid_btr.replay.numerics import PAPER_TIMING, choose_numerics
+from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import PAPER_TIMING, choose_numerics
+from sysid_btr.terms.grammar import parse_parameters
 
 TABLE1 = """
 Torso          1.22  0.00  0.07 -0.02 0     1      0  0.10 0.18 0.10
@@ -223,8 +223,8 @@ PUBLISHED = (203.5034, 20.3935, 3.1648)
 def emps_scores(log: Log, values: tuple[float, ...], numerics: Numerics) -> tuple[float, float, float]:
     """Position rmse in um; relative force error in %, of the whole log and after the first 0.3 s."""
     robot = emps()
-    modifiers = parse_parameters(["damping:slider", "frictionloss:slider", "constant_force:slider"], robot)
-    outputs = run(robot, log, modifiers, values, numerics, effort=True)
+    terms = parse_parameters(["damping:slider", "frictionloss:slider", "constant_force:slider"], robot)
+    outputs = run(robot, log, terms, values, numerics, effort=True)
     q, force = log.channels["position.slider"], log.channels["effort.slider"]
     assert outputs.effort is not None
     wrong = outputs.effort[0, :, 0] - force
@@ -291,8 +291,8 @@ def test_xl330_replays_every_log_with_a_converged_step(shared_data: Path) -> Non
     numerics, change = choose_numerics(robot, log)
     assert change < 0.02
     assert numerics.timestep > 0.001, "measured supply and flags must not force small steps"
-    modifiers = parse_parameters(["armature:*", "damping:*", "frictionloss:*"], robot)
-    outputs = run(robot, log, modifiers, [[0, 0, 0], [0.0043, 0.06, 0.04]], numerics)
+    terms = parse_parameters(["armature:*", "damping:*", "frictionloss:*"], robot)
+    outputs = run(robot, log, terms, [[0, 0, 0], [0.0043, 0.06, 0.04]], numerics)
     rmse = np.sqrt(np.mean((outputs.position[:, :, 0] - log.channels["position.pendulum"]) ** 2, axis=1))
     assert rmse[0] == pytest.approx(0.1345, abs=0.002)
     assert rmse[1] < 0.05

@@ -15,7 +15,6 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators import get_estimator
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
-from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.objectives.distance import (
     DistanceProblem,
     MeanSquare,
@@ -29,7 +28,8 @@ from sysid_btr.objectives.distance import (
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
-from sysid_btr.replay.engine import Replay
+from sysid_btr.simulation.engine import Replay
+from sysid_btr.terms.grammar import parse_parameters
 
 LABELS = st.lists(st.integers(0, 4), min_size=30, max_size=30)
 
@@ -136,10 +136,10 @@ def test_estimators_that_need_residuals_refuse_a_distance(estimator: str, name: 
 @pytest.mark.parametrize("name", ["mse", "phi1", "phi2:15", "wasserstein"])
 def test_the_true_gain_is_nearest(name: str) -> None:
     robot, log = pendulum(), swing(seconds=6.0)
-    modifiers = parse_parameters(["kp:arm"], robot)
-    truth = position(robot, log, modifiers, [0.9])
+    terms = parse_parameters(["kp:arm"], robot)
+    truth = position(robot, log, terms, [0.9])
     recorded = replace(log, channels={**log.channels, "position.arm": truth[:, 0]})
-    replay = Replay(robot, recorded, modifiers, FINE)
+    replay = Replay(robot, recorded, terms, FINE)
     episode = Episode(replay, make_targets(recorded, replay.index.joints, ("position",)))
     distance = get_distance(name)
     assert distance is not None

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from sysid_btr.errors import UsageError
-from sysid_btr.models.modifier import Parameter
 from sysid_btr.posterior.priors import LogNormal, Normal, Uniform, choose_priors, log_prior, moments, parse_prior
+from sysid_btr.terms.base import Parameter
 
 KNEE = Parameter("mass:Knee", "1", 1.0, 0.3, 3.0, 0.1)
 HIP = Parameter("mass:Hip", "1", 1.0, 0.3, 3.0, 0.1)

@@ -17,7 +17,7 @@ import typer
 import sysid_btr
 from sysid_btr.cli import app
 from sysid_btr.diagnosis.closing import Verdict
-from sysid_btr.effects.library import effect_names
+from sysid_btr.terms.library import effect_names
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]

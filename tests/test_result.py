@@ -18,10 +18,10 @@ from sysid_btr.identify.scores import ChannelScore, Scores
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.robot import load_robot
-from sysid_btr.replay.engine import Numerics
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.text import console, show
 from sysid_btr.result import clean, exit_code, make_result, read_result, to_json
+from sysid_btr.simulation.engine import Numerics
 from sysid_btr.units import si, si_all, with_digits_of
 
 PROMISED = {
@@ -111,7 +111,7 @@ def closing(study: Study, **changes: object) -> Closing:
         "candidates": (Candidate("coulomb_friction", ("hinge",), 0.9, math.nan, ()),),
         "steps": (StepRecord((), (), 44.0, 45.0), StepRecord(("coulomb_friction at hinge",), (), 1.0, 1.1)),
         "signature": {"period": np.float64(1.7), "joints": ["hinge"]},
-        "before_modifiers": (),
+        "before_terms": (),
         "before_values": np.zeros(0),
         "modifiers": (),
         "values": np.zeros(0),

@@ -12,21 +12,11 @@ import pytest
 from toys import pendulum, swing
 from walks import Truth, plain_walk, record_walk
 
-from sysid_btr.effects.base import Effect
-from sysid_btr.effects.command_delay import CommandDelay
-from sysid_btr.effects.constant_force import ConstantForce
-from sysid_btr.effects.foot_compliance import FootCompliance
-from sysid_btr.effects.foot_friction import FootFriction
-from sysid_btr.effects.gravity_tilt import GravityTilt
 from sysid_btr.errors import LogError
 from sysid_btr.estimators import Budget, Journal, silent
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.identify import walk as walk_module
-from sysid_btr.identify.deferred import deferred_fit
-from sysid_btr.identify.fit import Fit, fit
-from sysid_btr.identify.intervals import estimates
-from sysid_btr.identify.study import Study, make_study
-from sysid_btr.identify.walk import (
+from sysid_btr.floating_base import walk as walk_module
+from sysid_btr.floating_base.walk import (
     Walk,
     covered,
     cut_up,
@@ -37,17 +27,27 @@ from sysid_btr.identify.walk import (
     start_lanes,
     stride,
 )
+from sysid_btr.identify.deferred import deferred_fit
+from sysid_btr.identify.fit import Fit, fit
+from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.gait import Gait, gait
-from sysid_btr.models.grammar import parse_parameters
 from sysid_btr.models.robot import load_robot
 from sysid_btr.objectives.marginal import Marginal, projections
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.targets import Target
-from sysid_btr.replay.engine import Numerics
-from sysid_btr.replay.log import replay_log
-from sysid_btr.replay.windows import BASE, WindowReplay, Windows, on_slope
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.log import replay_log
+from sysid_btr.simulation.segments import BASE, WindowReplay, Windows, on_slope
+from sysid_btr.terms.command_delay import CommandDelay
+from sysid_btr.terms.constant_force import ConstantForce
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.foot_compliance import FootCompliance
+from sysid_btr.terms.foot_friction import FootFriction
+from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.gravity_tilt import GravityTilt
 
 FINE = Numerics("RK4", 0.001)
 LENGTH = 10
@@ -75,9 +75,9 @@ def true_windows(
     )
 
 
-def window_replay(log: Log, truth: Truth, *modifiers: object, **kwargs: object) -> WindowReplay:
+def window_replay(log: Log, truth: Truth, *terms: object, **kwargs: object) -> WindowReplay:
     robot = load_robot("nao")
-    bare = WindowReplay(robot, log, tuple(modifiers), FINE, threads=1)  # type: ignore[arg-type]
+    bare = WindowReplay(robot, log, tuple(terms), FINE, threads=1)  # type: ignore[arg-type]
     return replace(bare, windows=true_windows(log, truth, bare.index.joints, **kwargs))  # type: ignore[arg-type]
 
 
@@ -108,8 +108,8 @@ def test_windows_from_true_states_reproduce_the_whole_walk() -> None:
 
 def test_a_window_does_not_depend_on_the_others_nor_on_the_candidates_beside_it() -> None:
     log, truth = quiet_walk()
-    modifiers = parse_parameters(["mass:RKneePitch"], load_robot("nao"))
-    replay = window_replay(log, truth, *modifiers)
+    terms = parse_parameters(["mass:RKneePitch"], load_robot("nao"))
+    replay = window_replay(log, truth, *terms)
     whole = replay.predict(np.array([[0.8], [1.0], [1.3]])).position
     assert replay.windows is not None
     alone = replace(replay, windows=replay.windows.chosen(np.array([3])))
@@ -461,7 +461,7 @@ def test_a_walk_and_a_held_log_together_tell_more_than_either() -> None:
     def deviations(*logs: Log) -> np.ndarray:
         study = make_study(robot, logs, numerics=Numerics("RK4", 0.005), threads=2)
         problem = study.train_problem(study.declare(["mass:LKneePitch", "mass:LHipPitch"]))
-        residual, jacobian = linearise(problem, problem.start, step=study.stencil(problem.modifiers))
+        residual, jacobian = linearise(problem, problem.start, step=study.stencil(problem.terms))
         found = estimates(problem.parameters, problem.start, jacobian, residual, problem.blocks)
         return np.array([e.std for e in found])
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.io.log import Log, LogMeta
-from sysid_btr.models.modifier import Modifier, Outputs
 from sysid_btr.models.robot import Robot, robot_from_spec
-from sysid_btr.models.scales import JointScale
-from sysid_btr.replay.engine import Numerics, Replay
+from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.terms.base import Outputs, Term
+from sysid_btr.terms.scales import JointScale
 
 if TYPE_CHECKING:
     import mujoco
@@ -138,13 +138,13 @@ LEG_JOINTS = ("hip", "knee", "ankle")
 def run(
     robot: Robot,
     log: Log,
-    modifiers: Sequence[Modifier] = (),
+    terms: Sequence[Term] = (),
     values: Any = None,
     numerics: Numerics = FINE,
     **options: Any,
 ) -> Outputs:
     """Predicted sensors under one candidate (numbers) or several (rows)."""
-    replay = Replay(robot, log, tuple(modifiers), numerics, **options)
+    replay = Replay(robot, log, tuple(terms), numerics, **options)
     if values is None:
         values = [p.nominal for p in replay.parameters]
     candidates = np.atleast_2d(np.asarray(values, dtype=np.float64))

@@ -20,7 +20,7 @@ from benchmarks.blind.summary import latest, summarise
 from benchmarks.blind.table import Row, append, read_rows
 
 if TYPE_CHECKING:
-    from benchmarks.recorder.effects import Effect
+    from reference_simulator.effects import Effect
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -109,7 +109,7 @@ def _id(part: str, number: int, series: int) -> str:
 
 def examine(case: Case, code: str, recipe: str, out: Path, threads: int = 0) -> Row:
     """Record, close, judge. A log is recorded once; `close` sees the Parquet file and nothing else."""
-    from benchmarks.recorder import load_robot, save
+    from reference_simulator import load_robot, save
     from sysid_btr.diagnosis.close import close
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.blind.sizes import ALIKE, LIBRARY, OUTSIDE, Recipe, Stage
-from benchmarks.recorder import MOTIONS, Recording, Sensors, exact_channels, load_robot
+from reference_simulator import MOTIONS, Recording, Sensors, exact_channels, load_robot
 
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from benchmarks.recorder.effects import Effect
-    from benchmarks.recorder.robot import Robot
+    from reference_simulator.effects import Effect
+    from reference_simulator.robot import Robot
 
     Array = NDArray[np.float64]
     Names = tuple[str, ...]

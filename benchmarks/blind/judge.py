@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from benchmarks.recorder import effects as planted
+from reference_simulator import effects as planted
 
 if TYPE_CHECKING:
-    from benchmarks.recorder.effects import Effect
+    from reference_simulator.effects import Effect
 
 Outcome = Literal["yes", "ambiguous", "unexplained", "wrong", "missed", "error"]
 EVERYWHERE, ALL_BUT = 6, 0.8

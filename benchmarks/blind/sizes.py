@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.recorder import effects as planted
+from reference_simulator import effects as planted
 
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from benchmarks.recorder.effects import Effect
-    from benchmarks.recorder.robot import Robot
+    from reference_simulator.effects import Effect
+    from reference_simulator.robot import Robot
 
     Array = NDArray[np.float64]
     Names = tuple[str, ...]

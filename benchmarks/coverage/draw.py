@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from benchmarks.recorder import MOTIONS, Recording, Sensors, record
+from reference_simulator import MOTIONS, Recording, Sensors, record
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
-    from sysid_btr.replay.engine import Numerics
+    from sysid_btr.simulation.engine import Numerics
 
 HERE = Path(__file__).parent
 SAMPLE_LOGS = HERE.parents[1] / "sample_logs"
@@ -85,7 +85,7 @@ class Case:
         if numerics is None:
             return record(self.spec)[0]
         from sysid_btr.models.robot import load_robot
-        from sysid_btr.replay.log import replay_log
+        from sysid_btr.simulation.log import replay_log
 
         exact = Sensors(bits=0, position_noise=0.0)
         log, _ = record(replace(self.spec, sensors=exact))

@@ -46,7 +46,7 @@ def examine(case: Case, estimator: str, plant: str, threads: int = 1) -> list[Ro
     from sysid_btr.identify.fit import fit
     from sysid_btr.identify.study import make_study
     from sysid_btr.models.robot import load_robot
-    from sysid_btr.replay.numerics import choose_numerics
+    from sysid_btr.simulation.numerics import choose_numerics
 
     robot = load_robot(str(case.bench.model))
     log = case.log()

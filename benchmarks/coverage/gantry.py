@@ -17,7 +17,7 @@ from benchmarks.gantry import FIT, GANTRY, Truth, data_folder
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.identify.study import Study
-    from sysid_btr.models.modifier import Modifier
+    from sysid_btr.terms.base import Term
 
 BEGIN = 0.7
 """Where the search for an amount begins, as a factor of the true one: away from zero, where some say nothing."""
@@ -44,8 +44,8 @@ def examine_gantry(number: int, estimator: str, threads: int = 1) -> list[Row]:
     log = read_log(folder / f"gantry_{letter}.parquet")
     began = perf_counter()
     study = make_study(load_robot(str(folder / "nominal.xml")), [log], threads=threads)
-    modifiers, true, start = declared(study, GANTRY[letter])
-    found = fit(study, modifiers, start=start)
+    terms, true, start = declared(study, GANTRY[letter])
+    found = fit(study, terms, start=start)
     estimates, converged = ESTIMATORS[estimator](found)
     seconds = perf_counter() - began
     return [
@@ -75,12 +75,12 @@ def examine_gantry(number: int, estimator: str, threads: int = 1) -> list[Row]:
     ]
 
 
-def declared(study: Study, truth: Truth) -> tuple[tuple[Modifier, ...], FloatArray, FloatArray]:
-    """Masses, gains and the effects of a recording as modifiers; their true values (p,), and a start (p,)."""
-    from sysid_btr.effects.library import select_effects
+def declared(study: Study, truth: Truth) -> tuple[tuple[Term, ...], FloatArray, FloatArray]:
+    """Masses, gains and the effects of a recording as terms; their true values (p,), and a start (p,)."""
+    from sysid_btr.terms.library import select_effects
 
-    modifiers: list[Modifier] = list(study.declare(FIT))
-    true = [_scale(p.name, truth) for m in modifiers for p in m.parameters]
+    terms: list[Term] = list(study.declare(FIT))
+    true = [_scale(p.name, truth) for m in terms for p in m.parameters]
     start = [1.0] * len(true)
     for planted in truth.effects:
         own = select_effects([planted.name])[0]
@@ -92,8 +92,8 @@ def declared(study: Study, truth: Truth) -> tuple[tuple[Modifier, ...], FloatArr
             kind = parameter.name.partition(":")[0].partition(".")[2] or next(iter(amounts))
             true.append(amounts[kind])
             start.append(float(np.clip(BEGIN * amounts[kind], parameter.lower, parameter.upper)))
-        modifiers.append(effect)
-    return tuple(modifiers), np.array(true), np.array(start)
+        terms.append(effect)
+    return tuple(terms), np.array(true), np.array(start)
 
 
 def _scale(name: str, truth: Truth) -> float:

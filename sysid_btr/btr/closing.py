@@ -13,13 +13,13 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.trials import Tried
-from sysid_btr.effects.base import Effect
 from sysid_btr.errors import SysidError
 from sysid_btr.estimators.base import Budget, Progress, Termination, silent
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot
 from sysid_btr.session import Folder
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.effect import Effect
 
 if TYPE_CHECKING:
     from sysid_btr.btr.study import TrialStudy
@@ -44,12 +44,12 @@ class Joined:
     Attributes
     ----------
     message : in words.
-    modifiers, values : the model with the effects; empty where none was named.
+    terms, values : the model with the effects; empty where none was named.
     simulations : of beginnings of trials, that it took.
     """
 
     message: str
-    modifiers: tuple[Modifier, ...] = ()
+    terms: tuple[Term, ...] = ()
     values: FloatArray | tuple[float, ...] = ()
     simulations: int = 0
 
@@ -101,8 +101,8 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
     """
     from sysid_btr.btr.study import early_logs, trial_study
     from sysid_btr.diagnosis.close import close
-    from sysid_btr.effects.library import select_effects
     from sysid_btr.identify.refit import judge
+    from sysid_btr.terms.library import select_effects
     from sysid_btr.writeback.write import Identified, params_of
 
     logs = early_logs(stage, tried, LOGS)
@@ -110,7 +110,7 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
     if len(logs) < FEWEST:
         message = "fewer than two trials with a log of their first seconds: nothing can be looked for"
         return {"message": message, "params": None}
-    declared = _split(stage.world.modifiers, values)
+    declared = _split(stage.world.terms, values)
     free = [m for m, _ in declared if m.scope != "body"] or [m for m, _ in declared]
     held = tuple((m, v) for m, v in declared if m not in free)
     start = np.array([x for m, v in declared if m in free for x in v])
@@ -134,7 +134,7 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
         )
     except SysidError as error:
         return {"message": f"missing effects could not be looked for: {error}", "params": None}
-    found = _split(closing.modifiers, closing.values)
+    found = _split(closing.terms, closing.values)
     joining = found[len(free) :]
     first, last = closing.steps[0].holdout, closing.steps[-1].holdout
     spent = closing.replays * len(logs)
@@ -145,27 +145,27 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
     joining, spent = found[len(free) :], spent + apart * len(logs)
     fitted = {id(m): v for m, v in found}
     model = [*((m, fitted.get(id(m), v)) for m, v in declared), *joining]
-    modifiers = tuple(m for m, _ in model)
+    terms = tuple(m for m, _ in model)
     numbers = np.array([x for _, v in model for x in v])
     told = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining)
     return {
         "message": f"joined the model: {told}; {_score(first, last)}",
         "simulations": spent,
-        "params": params_of(Identified(study, modifiers, numbers, (), ())),
-        "modifiers": modifiers,
+        "params": params_of(Identified(study, terms, numbers, (), ())),
+        "modifiers": terms,
         "values": numbers,
     }
 
 
 def _tell_apart(
-    study: TrialStudy, found: list[tuple[Modifier, tuple[float, ...]]], declared: int, left: float
-) -> tuple[list[tuple[Modifier, tuple[float, ...]]], float, int]:
+    study: TrialStudy, found: list[tuple[Term, tuple[float, ...]]], declared: int, left: float
+) -> tuple[list[tuple[Term, tuple[float, ...]]], float, int]:
     """The model with amounts of their own at every place for effects where held-out trials want that.
 
-    `found` are modifiers and values, the declared ones first; `left` is the mean squared held-out error so far.
+    `found` are terms and values, the declared ones first; `left` is the mean squared held-out error so far.
     Returned with that of the model, and the candidates that it took.
     """
-    from sysid_btr.btr.beginnings import Beginnings, model_fit
+    from sysid_btr.btr.map_problem import Beginnings, model_fit
     from sysid_btr.identify.refit import judge
 
     spent = 0
@@ -175,17 +175,17 @@ def _tell_apart(
             continue
         own = _own_amounts(effect)
         trying = [*found[:i], (own, values * len(effect.places)), *found[i + 1 :]]
-        modifiers = tuple(m for m, _ in trying)
-        problem = Beginnings(study.train_problem(modifiers, np.array([x for _, v in trying for x in v])))
+        terms = tuple(m for m, _ in trying)
+        problem = Beginnings(study.train_problem(terms, np.array([x for _, v in trying for x in v])))
         estimate = model_fit().fit(
             problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
         )
         if estimate.termination is Termination.INTERRUPTED:
             raise KeyboardInterrupt
-        judged = judge(study, modifiers, estimate.x, estimate.evaluations)
+        judged = judge(study, terms, estimate.x, estimate.evaluations)
         spent += judged.evaluations
         if judged.holdout < LEFT * left:
-            found, left = _split(modifiers, estimate.x), judged.holdout
+            found, left = _split(terms, estimate.x), judged.holdout
     return found, left, spent
 
 
@@ -196,20 +196,20 @@ def _own_amounts(effect: Effect) -> Effect:
     return replace(bare, known=tuple(replace(k, name=p.name) for k, p in zip(known, bare.parameters, strict=True)))
 
 
-def _split(modifiers: Sequence[Modifier], values: FloatArray) -> list[tuple[Modifier, tuple[float, ...]]]:
-    """Modifiers with their own values."""
+def _split(terms: Sequence[Term], values: FloatArray) -> list[tuple[Term, tuple[float, ...]]]:
+    """Terms with their own values."""
     result, column = [], 0
-    for m in modifiers:
+    for m in terms:
         own = values[column : column + len(m.parameters)]
         column += len(own)
         result.append((m, tuple(float(v) for v in own)))
     return result
 
 
-def _amounts(modifier: Modifier, values: tuple[float, ...]) -> str:
+def _amounts(term: Term, values: tuple[float, ...]) -> str:
     """Values in words: each kind's, and where it has several places their range."""
-    own = np.reshape(values, (-1, len(modifier.kinds)))
-    units = [p.unit for p in modifier.parameters]
+    own = np.reshape(values, (-1, len(term.kinds)))
+    units = [p.unit for p in term.parameters]
     return ", ".join(
         f"{low:.3g} {unit}" if low == high else f"{low:.3g} to {high:.3g} {unit}"
         for low, high, unit in zip(own.min(axis=0), own.max(axis=0), units, strict=False)
@@ -235,4 +235,4 @@ def _read(summary: dict[str, Any], params: Path, robot: Robot) -> Joined:
     from sysid_btr.writeback.params import read_params
 
     own = read_params(params, robot)
-    return Joined(summary["message"], own.modifiers, own.values, spent)
+    return Joined(summary["message"], own.terms, own.values, spent)

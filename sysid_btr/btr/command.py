@@ -53,7 +53,6 @@ class Asked:
 
     def settings(self, space: ControllerSpace) -> Settings:
         """How the loop searches."""
-        from sysid_btr.btr.beginnings import model_fit
         from sysid_btr.btr.loop import (
             LIKELIHOOD,
             Settings,
@@ -62,6 +61,7 @@ class Asked:
             model_search,
             papers_model_search,
         )
+        from sysid_btr.btr.map_problem import model_fit
 
         models: dict[str, Estimator] = {"cmaes": model_search(), "ga": papers_model_search(), "lsq": model_fit()}
         by_distance = "lsq" if self.distance == LIKELIHOOD else "cmaes"
@@ -93,7 +93,7 @@ class Asked:
         from sysid_btr.btr.robot import HiddenRobot, Noise
         from sysid_btr.btr.world import make_world
         from sysid_btr.models.robot import load_robot
-        from sysid_btr.replay.log import set_parameters
+        from sysid_btr.simulation.log import set_parameters
 
         if (self.robot_sim is None) == (self.exchange is None):
             raise UsageError(
@@ -105,8 +105,8 @@ class Asked:
                 raise UsageError("--robot-set changes a --robot-sim; a real robot is what it is")
             return FolderExchange(self.exchange, task, space, self.model.name, patience=self.wait, say=remark)
         hidden = load_robot(str(self.robot_sim))
-        modifiers, truth = set_parameters(hidden, self.robot_set)
-        return HiddenRobot(make_world(hidden, task, modifiers, threads=1), truth, task, space, Noise(), self.seed)
+        terms, truth = set_parameters(hidden, self.robot_set)
+        return HiddenRobot(make_world(hidden, task, terms, threads=1), truth, task, space, Noise(), self.seed)
 
 
 def run_btr(asked: Asked, out: Path | None, resume: bool, overwrite: bool) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def run_btr(asked: Asked, out: Path | None, resume: bool, overwrite: bool) -> di
     from sysid_btr.btr.loop import back_to_reality
     from sysid_btr.btr.result import btr_result
     from sysid_btr.btr.task import Walk
-    from sysid_btr.models.grammar import parse_parameters
+    from sysid_btr.terms.grammar import parse_parameters
 
     if not asked.free:
         raise UsageError(what_can_be_freed(asked.model))
@@ -132,14 +132,14 @@ def run_btr(asked: Asked, out: Path | None, resume: bool, overwrite: bool) -> di
     if not duration >= 1:
         raise UsageError(f"--duration {duration:g}: a trial needs a second at least")
     task, settings = Walk(duration), asked.settings(space)
-    modifiers, robot = parse_parameters(asked.free, asked.model), asked.robot(task, space)
+    terms, robot = parse_parameters(asked.free, asked.model), asked.robot(task, space)
     folder = None if out is None else _open(out, resume, overwrite)
     began = perf_counter()
     with ProgressLine("btr") as progress:
         try:
             outcome = back_to_reality(
                 asked.model,
-                modifiers,
+                terms,
                 robot,
                 space,
                 task=task,

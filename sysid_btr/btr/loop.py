@@ -18,12 +18,12 @@ import numpy as np
 
 from sysid_btr import __version__
 from sysid_btr._typing import FloatArray
-from sysid_btr.btr.beginnings import Beginnings
 from sysid_btr.btr.choice import Pool, get_choice, pool_of
 from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
+from sysid_btr.btr.map_problem import Beginnings
 from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
 from sysid_btr.btr.study import early, early_logs, trial_study
@@ -37,9 +37,9 @@ from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.models.modifier import Modifier, Parameter
 from sysid_btr.models.robot import Robot as Model
 from sysid_btr.objectives.distance import get_distance
+from sysid_btr.terms.base import Parameter, Term
 
 PATIENCE = 3
 """Iterations without progress after which disengagement is looked for."""
@@ -226,7 +226,7 @@ class BackToReality:
 
 def back_to_reality(
     model: Model,
-    modifiers: Sequence[Modifier],
+    terms: Sequence[Term],
     robot: Robot,
     space: ControllerSpace,
     *,
@@ -242,7 +242,7 @@ def back_to_reality(
 
     Parameters
     ----------
-    model, modifiers : the model, and what of it is unknown.
+    model, terms : the model, and what of it is unknown.
     robot : on which controllers are tried.
     space, task : controllers, and what they are for.
     settings : default those of the paper's ant.
@@ -258,10 +258,10 @@ def back_to_reality(
     UsageError
         If the folder holds another run's work.
     """
-    if not modifiers:
+    if not terms:
         raise UsageError("nothing of the model is unknown: name what the trials may correct (--fit)")
     settings = Settings() if settings is None else settings
-    loop = _Loop(model, robot, space, task, settings, seed, folder, threads, progress, say, tuple(modifiers))
+    loop = _Loop(model, robot, space, task, settings, seed, folder, threads, progress, say, tuple(terms))
     return loop.go()
 
 
@@ -279,19 +279,19 @@ class _Loop:
     threads: int
     progress: Progress
     say: Callable[[str], None]
-    modifiers: tuple[Modifier, ...]
+    terms: tuple[Term, ...]
     simulations: int = 0
 
     def __post_init__(self) -> None:
         self.book = TrialBook(None if self.folder is None else self.folder / "trials")
-        self.stage = self._stage(self.modifiers)
+        self.stage = self._stage(self.terms)
         self.values = np.array([p.nominal for p in self.stage.parameters])
         self.rounds: list[Iteration] = []
         self.rivals = self.values[None]
         self._print = self._fingerprint()
 
-    def _stage(self, modifiers: tuple[Modifier, ...]) -> Stage:
-        return Stage(make_world(self.model, self.task, modifiers, threads=self.threads), self.task, self.space)
+    def _stage(self, terms: tuple[Term, ...]) -> Stage:
+        return Stage(make_world(self.model, self.task, terms, threads=self.threads), self.task, self.space)
 
     @property
     def _beginning(self) -> float:
@@ -403,7 +403,7 @@ class _Loop:
             if not logs:
                 return None
             study = trial_study(self.stage, logs, (), self.threads)
-            asked = Beginnings(study.train_problem(self.stage.world.modifiers, problem.start), self._beginning)
+            asked = Beginnings(study.train_problem(self.stage.world.terms, problem.start), self._beginning)
         found, journal = self._search(number, step, self.settings.models, asked)
         if not np.isfinite(found.loss):
             return None
@@ -450,9 +450,9 @@ class _Loop:
         noted = _noted(self.progress, f"iteration {number}, closing")
         joined: Joined = join_effects(self.stage, values, self.book.made, kept, self.threads, noted)
         self.simulations += round(self._beginning * joined.simulations)
-        if joined.modifiers:
-            self.modifiers = joined.modifiers
-            self.stage = self._stage(self.modifiers)
+        if joined.terms:
+            self.terms = joined.terms
+            self.stage = self._stage(self.terms)
             self.values = np.clip(
                 joined.values,
                 [p.lower for p in self.stage.parameters],

@@ -16,9 +16,9 @@ from sysid_btr.btr.task import Walk
 from sysid_btr.btr.world import World
 from sysid_btr.estimators.base import Problem
 from sysid_btr.io.log import Log
-from sysid_btr.models.modifier import Parameter
 from sysid_btr.objectives.distance import Distance, get_distance, phi1
 from sysid_btr.objectives.targets import Target, make_targets
+from sysid_btr.terms.base import Parameter
 
 FITNESS = "phi1"
 """The distance that compares fitness; all others compare sensors."""

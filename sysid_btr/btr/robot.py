@@ -62,7 +62,7 @@ class HiddenRobot:
 
     Attributes
     ----------
-    world, truth : the robot, and the values (p,) of its modifiers.
+    world, truth : the robot, and the values (p,) of its terms.
     task, space : what it does, and what controllers it plays.
     noise : of its sensors.
     seed : of the noise; the same controller is seen with the same noise.

@@ -18,11 +18,11 @@ from sysid_btr.btr.trials import Tried
 from sysid_btr.btr.world import World
 from sysid_btr.identify.study import Study, measure_scales
 from sysid_btr.io.log import Log
-from sysid_btr.models.modifier import Modifier, Outputs
-from sysid_btr.models.scales import Scales
 from sysid_btr.objectives.problem import Episode
 from sysid_btr.objectives.targets import make_targets
-from sysid_btr.replay.engine import Numerics
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.terms.base import Outputs, Term
+from sysid_btr.terms.scales import Scales
 
 CHANNELS = ("position",)
 SECONDS = 2.0
@@ -30,8 +30,8 @@ SECONDS = 2.0
 joints along, and what a whole replay shows is chaos more and more, whatever the model."""
 
 
-Held = tuple[tuple[Modifier, tuple[float, ...]], ...]
-"""Modifiers and their values."""
+Held = tuple[tuple[Term, tuple[float, ...]], ...]
+"""Terms and their values."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class TrialReplay(World):
     held: Held = ()
 
     @property
-    def all_modifiers(self) -> tuple[Modifier, ...]:
-        return (*self.robot.always, *(m for m, _ in self.held), *self.modifiers)
+    def all_terms(self) -> tuple[Term, ...]:
+        return (*self.robot.always, *(m for m, _ in self.held), *self.terms)
 
-    def _values(self, candidates: FloatArray) -> list[tuple[Modifier, FloatArray]]:
+    def _values(self, candidates: FloatArray) -> list[tuple[Term, FloatArray]]:
         fixed = [value for _, values in self.held for value in values]
         return super()._values(np.column_stack([np.tile(fixed, (len(candidates), 1)), candidates]))
 
@@ -89,20 +89,20 @@ class TrialStudy(Study):
         return self.numerics
 
     def settled(
-        self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True, anew: bool = True
+        self, terms: Sequence[Term], values: FloatArray, *, held: bool = True, anew: bool = True
     ) -> Study:
         """As it is: where a trial began is known."""
         return self
 
-    def _replay(self, log: Log, modifiers: Sequence[Modifier], *, effort: bool = False) -> TrialReplay:
+    def _replay(self, log: Log, terms: Sequence[Term], *, effort: bool = False) -> TrialReplay:
         return TrialReplay(
-            self.robot, log, tuple(modifiers), self.numerics, effort=effort, threads=self.threads, held=self.held
+            self.robot, log, tuple(terms), self.numerics, effort=effort, threads=self.threads, held=self.held
         )
 
     def _episode(
-        self, log: Log, modifiers: Sequence[Modifier], channels: tuple[str, ...], begin: float, end: float
+        self, log: Log, terms: Sequence[Term], channels: tuple[str, ...], begin: float, end: float
     ) -> Episode:
-        run = self._replay(log, modifiers)
+        run = self._replay(log, terms)
         targets = self.with_inflation(log, make_targets(log, run.index.joints, channels, 0.0))
         time = log.time - log.time[0]
         return Episode(run, tuple(t.window(begin, end, time) for t in targets))
@@ -118,7 +118,7 @@ def trial_study(
     stage : the model so far.
     logs, held_out : of trials; at least one each.
     threads : worker threads.
-    held : modifiers that stay at given values.
+    held : terms that stay at given values.
     """
     time = early(stage)
     return TrialStudy(

@@ -13,10 +13,10 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.btr.task import Walk
 from sysid_btr.errors import ModelError
 from sysid_btr.io.log import Log, LogMeta
-from sysid_btr.models.modifier import Index, Modifier, Outputs, Rig
 from sysid_btr.models.robot import Robot
-from sysid_btr.replay.engine import CHUNK, Numerics, Replay, make_index, set_out, write_model
-from sysid_btr.replay.quiet import quiet
+from sysid_btr.simulation.engine import CHUNK, Numerics, Replay, make_index, set_out, write_model
+from sysid_btr.simulation.silence import quiet
+from sysid_btr.terms.base import Index, Outputs, Rig, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -87,7 +87,7 @@ class World(Replay):
         batch.bind("qpos")[:, index.base[0] + 2] -= lowest(self.model, batch)
         return self._go(rig, pairs, held, applied, grid)
 
-    def _rig(self, batch: Batch, pairs: list[tuple[Modifier, FloatArray]]) -> Rig:
+    def _rig(self, batch: Batch, pairs: list[tuple[Term, FloatArray]]) -> Rig:
         rig = Rig(self.model, batch, self.index, self.numerics.timestep)
         write_model(rig, pairs)
         return rig
@@ -160,13 +160,13 @@ def _reach(kind: int, size: FloatArray, up: FloatArray) -> FloatArray:
 
 
 def make_world(
-    robot: Robot, task: Walk, modifiers: Sequence[Modifier] = (), *, halvings: int = 0, threads: int = 0
+    robot: Robot, task: Walk, terms: Sequence[Term] = (), *, halvings: int = 0, threads: int = 0
 ) -> World:
     """The world of a robot and a task.
 
     Parameters
     ----------
-    robot, modifiers : the model and what of it a candidate changes.
+    robot, terms : the model and what of it a candidate changes.
     task : length and sampling of a trial.
     halvings : times the step is halved below the one that the model states (at most `STEP`).
     threads : worker threads, 0 for all cores.
@@ -179,4 +179,4 @@ def make_world(
         meta=LogMeta(robot=robot.name, mount="free", sample_period=task.period),
         episode=np.zeros(len(task.time), dtype=np.int64),
     )
-    return World(robot, log, tuple(modifiers), Numerics("implicitfast", float(step)), threads=threads)
+    return World(robot, log, tuple(terms), Numerics("implicitfast", float(step)), threads=threads)

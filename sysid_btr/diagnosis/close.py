@@ -17,15 +17,14 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord, Verdict
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
+from sysid_btr.diagnosis.messages import message_of, sentence_of
 from sysid_btr.diagnosis.scan import Question, Trace, questions, scan
 from sysid_btr.diagnosis.signature import proposals, signature
 from sysid_btr.diagnosis.split import later_split
-from sysid_btr.diagnosis.words import message_of, sentence_of
-from sysid_btr.effects.base import Effect
-from sysid_btr.effects.library import select_effects
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.estimators.lsq import linearise
+from sysid_btr.floating_base.fusion import weigh_walks
 from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.refit import (
@@ -41,9 +40,10 @@ from sysid_btr.identify.refit import (
 )
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.study import Study
-from sysid_btr.identify.weighing import weigh_walks
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import body_names, joint_names, servo_joints
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.library import select_effects
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -123,7 +123,7 @@ class _State:
 
 def close(
     study: Study,
-    parameters: Sequence[str] | Sequence[Modifier],
+    parameters: Sequence[str] | Sequence[Term],
     *,
     effects: Sequence[str] = ("all",),
     rng: Generator | None = None,
@@ -160,7 +160,7 @@ def close(
     library = usable_effects(select_effects(effects), study)
     first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
     study = replace(first.study, journal=None if journal is None else journal.section())
-    declared = first.modifiers
+    declared = first.terms
     # hypotheses are compared where each fits best
     study, before = inflated(study, judge(study, declared, first.optimum, first.replays))
     state = _State(before, ())
@@ -218,10 +218,10 @@ def close(
             keep = [i for i, e in enumerate(state.effects) if e in staying]
             state = _State(state.fitted, staying, tuple(state.rivals[i] for i in keep))
         if study.free:
-            study = study.settled(fitted.modifiers, fitted.values)
+            study = study.settled(fitted.terms, fitted.values)
         study, fitted = robust_refit(study, fitted, 1)
         replays += fitted.evaluations
-        state = _State(fitted, (*state.effects, hypothesis.modifier(study.scales)), (*state.rivals, rivals))
+        state = _State(fitted, (*state.effects, hypothesis.term(study.scales)), (*state.rivals, rivals))
         steps.append(StepRecord((str(hypothesis),), (), fitted.train, fitted.holdout))
     state, removed, spent = _prune(study, state, declared)
     replays += spent
@@ -231,7 +231,7 @@ def close(
         state = _merge(study, state, declared)
         study = inflate(study, state.fitted, memory=True)
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="final fit")
-        polished = refit(study, state.fitted.modifiers, state.fitted.values, polish=True, progress=progress)
+        polished = refit(study, state.fitted.terms, state.fitted.values, polish=True, progress=progress)
         replays += polished.evaluations
         state = replace(state, fitted=polished)
     final_estimates: tuple[Estimate, ...] = first.estimates
@@ -267,9 +267,9 @@ def close(
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
     if verdict == "unexplained" or (kept and _something_left(before, state.fitted)):
-        left = signature(study, state.fitted.modifiers, state.fitted.values)
+        left = signature(study, state.fitted.terms, state.fitted.values)
     state = replace(state, fitted=last)
-    after = score(study, state.fitted.modifiers, state.fitted.values)
+    after = score(study, state.fitted.terms, state.fitted.values)
     unit = "m" if all(s.slide for s in study.scales.values()) else "rad"
     return Closing(
         study=study,
@@ -284,9 +284,9 @@ def close(
         candidates=tuple(sorted(candidates, key=lambda c: -c.explained)),
         steps=tuple(steps),
         signature=left,
-        before_modifiers=declared,
+        before_terms=declared,
         before_values=first.values,
-        modifiers=state.fitted.modifiers,
+        terms=state.fitted.terms,
         values=state.fitted.values,
         replays=replays,
         seconds=perf_counter() - began,
@@ -299,7 +299,7 @@ def _without(
     fitted: Fitted,
     kept: tuple[Effect, ...],
     hypothesis: Hypothesis,
-    declared: tuple[Modifier, ...],
+    declared: tuple[Term, ...],
 ) -> Fitted:
     """Refit with a new effect, and without those it makes superfluous."""
     column = sum(len(m.parameters) for m in declared)
@@ -310,8 +310,8 @@ def _without(
             values.append(fitted.values[column : column + size])
         column += size
     values.append(hypothesis.start)
-    modifiers = (*declared, *kept, hypothesis.modifier(study.scales))
-    return refit(study, modifiers, np.concatenate(values))
+    terms = (*declared, *kept, hypothesis.term(study.scales))
+    return refit(study, terms, np.concatenate(values))
 
 
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
@@ -355,8 +355,8 @@ def _scan(
     study: Study, state: _State, library: Sequence[type[Effect]], alike: bool
 ) -> tuple[list[Trace], FloatArray]:
     values = state.fitted.values
-    problem = shorten(study, SCAN_SECONDS).train_problem(state.fitted.modifiers, values)
-    residual, jacobian = linearise(problem, values, step=study.stencil(state.fitted.modifiers))
+    problem = shorten(study, SCAN_SECONDS).train_problem(state.fitted.terms, values)
+    residual, jacobian = linearise(problem, values, step=study.stencil(state.fitted.terms))
     places = {
         "joint": joint_names(study.robot),
         "servo": servo_joints(study.robot),
@@ -377,8 +377,8 @@ def _scan(
         if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
     ]
     if study.free and len(asked) > GLANCED:
-        glance = shorten(study, GLANCE_SECONDS).train_problem(state.fitted.modifiers, values)
-        linear = linearise(glance, values, step=study.stencil(glance.modifiers))
+        glance = shorten(study, GLANCE_SECONDS).train_problem(state.fitted.terms, values)
+        linear = linearise(glance, values, step=study.stencil(glance.terms))
         seen = scan(glance, values, *linear, asked, study.scales)
         asked = [t.question for t in seen[:GLANCED]]
     # what is left is the right integrator's; what an effect would change may be a little off
@@ -395,15 +395,15 @@ def _scan(
 def _try(
     study: Study, state: _State, hypothesis: Hypothesis, values: FloatArray | None = None
 ) -> Fitted:
-    modifiers = (*state.fitted.modifiers, hypothesis.modifier(study.scales))
+    terms = (*state.fitted.terms, hypothesis.term(study.scales))
     rest = state.fitted.values if values is None else values
     ladder = hypothesis.ladder()
     starts = np.column_stack([np.tile(rest, (len(ladder), 1)), ladder])
     seconds = REFIT_SECONDS if len(starts) <= FEW_STARTS else LADDER_SECONDS
     spent = 0
     while True:
-        start = best_start(shorten(study, seconds), modifiers, starts)
-        found = refit(shorten(study, REFIT_SECONDS), modifiers, start, judged=study)
+        start = best_start(shorten(study, seconds), terms, starts)
+        found = refit(shorten(study, REFIT_SECONDS), terms, start, judged=study)
         spent += found.evaluations + len(starts)
         finer = study.numerics.halved()
         given_up = study.free or finer.integrator == "Euler" or finer.timestep < FINEST
@@ -447,7 +447,7 @@ def _thin(
     spent = 0
     kinds = len(hypothesis.effect.kinds)
     main = hypothesis.effect.main
-    neutral = hypothesis.modifier(study.scales).neutral[main]
+    neutral = hypothesis.term(study.scales).neutral[main]
     once = hypothesis.effect.passing
     waiting = True
     while waiting and not hypothesis.shared and 1 < len(hypothesis.places) <= MOST_THINNED:
@@ -607,7 +607,7 @@ def _candidates(
 
 
 def _prune(
-    study: Study, state: _State, declared: tuple[Modifier, ...]
+    study: Study, state: _State, declared: tuple[Term, ...]
 ) -> tuple[_State, tuple[str, ...], int]:
     """Backward pass: drop effects without which held-out data are predicted as well."""
     removed: list[str] = []
@@ -633,7 +633,7 @@ def _prune(
 
 
 def _thin_again(
-    study: Study, state: _State, effect: Effect, declared: tuple[Modifier, ...]
+    study: Study, state: _State, effect: Effect, declared: tuple[Term, ...]
 ) -> tuple[_State, tuple[str, ...], int]:
     """Drop places of an effect that were in demand only until a later effect was found."""
     if effect.shared:
@@ -643,19 +643,19 @@ def _thin_again(
     first = sum(len(m.parameters) for m in (*declared, *state.effects[:at]))
     own = slice(first, first + len(effect.parameters))
     values = np.delete(state.fitted.values, own)
-    rest = replace(state.fitted, modifiers=(*declared, *others), values=values)
+    rest = replace(state.fitted, terms=(*declared, *others), values=values)
     amounts = state.fitted.values[own]
     whole = Hypothesis(type(effect), effect.places, False, amounts, 0.0)
     now = replace(
-        state.fitted, modifiers=(*rest.modifiers, effect), values=np.concatenate([values, amounts])
+        state.fitted, terms=(*rest.terms, effect), values=np.concatenate([values, amounts])
     )
     left, fitted, spent = _thin(study, _State(rest, others), whole, now)
     rivals = (*state.rivals[:at], *state.rivals[at + 1 :], state.rivals[at])
     dropped = tuple(p for p in effect.places if p not in left.places)
-    return _State(fitted, (*others, left.modifier(study.scales)), rivals), dropped, spent
+    return _State(fitted, (*others, left.term(study.scales)), rivals), dropped, spent
 
 
-def _merge(study: Study, state: _State, declared: tuple[Modifier, ...]) -> _State:
+def _merge(study: Study, state: _State, declared: tuple[Term, ...]) -> _State:
     """Effects of one kind found in several rounds become one; amounts that agree become one amount."""
     offset = sum(len(m.parameters) for m in declared)
     pieces: dict[type[Effect], list[tuple[str, FloatArray]]] = {}
@@ -677,8 +677,8 @@ def _merge(study: Study, state: _State, declared: tuple[Modifier, ...]) -> _Stat
         even = len(found) > 2 and bool(np.all(np.abs(main - middle) <= EVEN_SPREAD * abs(middle)))
         values.append(np.median(amounts, axis=0) if even else amounts.ravel())
         merged.append(kind.at(places, study.scales, shared=even).around(values[-1]))
-    modifiers = (*declared, *merged)
-    fitted = replace(state.fitted, modifiers=modifiers, values=np.concatenate(values))
+    terms = (*declared, *merged)
+    fitted = replace(state.fitted, terms=terms, values=np.concatenate(values))
     # what is in the model beside an effect is not its rival
     present = {kind.name for kind in pieces}
     kept = tuple(tuple(name for name in names if name not in present) for names in confused.values())
@@ -693,9 +693,9 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
     """
     for refinement in range(MAX_REFINEMENTS + 1):
         fitted = state.fitted
-        problem = study.train_problem(fitted.modifiers, fitted.values)
+        problem = study.train_problem(fitted.terms, fitted.values)
         if refinement == 0:
-            residual, jacobian = linearise(problem, fitted.values, step=study.stencil(fitted.modifiers))
+            residual, jacobian = linearise(problem, fitted.values, step=study.stencil(fitted.terms))
             jacobian = np.nan_to_num(jacobian)
         else:  # what half the step changes in the derivatives is far less than what is known of them
             residual = problem.residuals(fitted.values[None])[0]
@@ -713,14 +713,14 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
         if settled or refinement == MAX_REFINEMENTS:
             break
         study = replace(study, numerics=study.numerics.halved())
-        state = replace(state, fitted=refit(study, fitted.modifiers, fitted.values, iterations=4))
+        state = replace(state, fitted=refit(study, fitted.terms, fitted.values, iterations=4))
     values, found, _ = hold_unidentifiable(problem, fitted.values, found, jacobian, known)
-    last = judge(study, fitted.modifiers, values)
+    last = judge(study, fitted.terms, values)
     return found, study, replace(state, fitted=last) if known is None else state, last
 
 
 def _told_apart_from_nothing(
-    study: Study, state: _State, declared: tuple[Modifier, ...], found: Sequence[Estimate]
+    study: Study, state: _State, declared: tuple[Term, ...], found: Sequence[Estimate]
 ) -> _State | None:
     """The model without effects, and places of effects, whose amounts may be nothing; None where there are none.
 
@@ -790,7 +790,7 @@ def _named(
     state: _State,
     before: Fitted,
     found: Sequence[Estimate],
-    declared: tuple[Modifier, ...],
+    declared: tuple[Term, ...],
     candidates: Sequence[Candidate],
 ) -> tuple[NamedEffect, ...]:
     result, column = [], 0
@@ -800,7 +800,7 @@ def _named(
         own = tuple(found[column : column + size])
         without = state.fitted.values.copy()
         without[offset + column : offset + column + size] = effect.neutral
-        off = judge(study, state.fitted.modifiers, without)
+        off = judge(study, state.fitted.terms, without)
         gain = (off.holdout - state.fitted.holdout) / max(off.holdout, 1e-12)
         confused = (*confused, *(n for n in _alike(effect, candidates) if n not in confused))
         result.append(

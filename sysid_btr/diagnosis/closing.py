@@ -10,7 +10,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
-from sysid_btr.models.modifier import Modifier
+from sysid_btr.terms.base import Term
 
 Verdict = Literal["explained", "nothing_missing", "ambiguous", "unexplained"]
 
@@ -83,7 +83,7 @@ class Closing:
     candidates : what was weighed, best first.
     steps : every step of the way.
     signature : of the residual that is left, when unexplained or where effects that are named leave much of it.
-    modifiers, values : the final model.
+    terms, values : the final model.
     replays, seconds : cost.
     """
 
@@ -99,9 +99,9 @@ class Closing:
     candidates: tuple[Candidate, ...]
     steps: tuple[StepRecord, ...]
     signature: Mapping[str, Any] | None
-    before_modifiers: tuple[Modifier, ...]
+    before_terms: tuple[Term, ...]
     before_values: FloatArray
-    modifiers: tuple[Modifier, ...]
+    terms: tuple[Term, ...]
     values: FloatArray
     replays: int
     seconds: float

@@ -9,8 +9,8 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.scan import Trace
-from sysid_btr.effects.base import Effect
-from sysid_btr.models.scales import Scales
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.scales import Scales
 
 NEW_PLACE = 0.02
 """A further place must explain this fraction of what its effect explains at all places so far."""
@@ -58,7 +58,7 @@ class Hypothesis:
         amounts = [self.effect.ladder(a) for a in self.start.reshape(-1, kinds)]
         return np.vstack([self.start, np.hstack(amounts)])
 
-    def modifier(self, scales: Scales) -> Effect:
+    def term(self, scales: Scales) -> Effect:
         return self.effect.at(self.places, scales, shared=self.shared).around(self.start)
 
     def __str__(self) -> str:

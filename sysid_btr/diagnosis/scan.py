@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.effects.base import Effect, Probe, middle_scale, scale_at
-from sysid_btr.models.modifier import Modifier
-from sysid_btr.models.scales import Scales
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.replay.structure import EVERYWHERE
+from sysid_btr.simulation.subtrees import EVERYWHERE
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.effect import Effect, Probe, middle_scale, scale_at
+from sysid_btr.terms.scales import Scales
 
 FAINT = 1e-4
 """Squared response of a direction, relative to an effect's strongest one, below which it is not moved."""
@@ -95,7 +95,7 @@ def scan(
 
     Parameters
     ----------
-    problem : data and declared modifiers.
+    problem : data and declared terms.
     values : (p,) fitted.
     residual, jacobian : (r,) and (r, p) there, whitened.
     asked : effects, places, working points.
@@ -182,19 +182,19 @@ def _ask(
     asked: list[Question],
     scales: Scales,
 ) -> list[Trace]:
-    """Simulate questions that share a set of modifiers."""
+    """Simulate questions that share a set of terms."""
     where = problem.where
-    extra: list[Modifier] = []
+    extra: list[Term] = []
     offset: dict[tuple[type[Effect], str], int] = {}
     column = len(values)
     for effect in dict.fromkeys(q.effect for q in asked):
         places = tuple(dict.fromkeys(p for q in asked if q.effect is effect for p in q.places))
-        modifier = effect.at(places, scales)
+        term = effect.at(places, scales)
         for i, place in enumerate(places):
             offset[effect, place] = column + i * len(effect.kinds)
-        column += len(modifier.parameters)
-        extra.append(modifier)
-    wide = problem.with_modifiers((*problem.modifiers, *extra), values)
+        column += len(term.parameters)
+        extra.append(term)
+    wide = problem.with_terms((*problem.terms, *extra), values)
     neutral = np.concatenate([values, *(m.neutral for m in extra if isinstance(m, Effect))])
     # one simulation carries one direction of one question in each limb
     lanes: dict[int, list[tuple[int, int]]] = {}

@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis import patterns
-from sysid_btr.diagnosis.patterns import Line, Train, hats, predicted_share, without
+from sysid_btr.diagnosis import signal_features
 from sysid_btr.diagnosis.scan import Question
+from sysid_btr.diagnosis.signal_features import Line, Train, hats, predicted_share, without
 from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
-from sysid_btr.effects.base import Effect
-from sysid_btr.effects.cogging import Cogging
-from sysid_btr.effects.external_disturbance import (
+from sysid_btr.identify.study import Study
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.cogging import Cogging
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.external_disturbance import (
     DriveDisturbanceTrain,
     ExternalDisturbance,
     ExternalDisturbanceTrain,
 )
-from sysid_btr.identify.study import Study
-from sysid_btr.models.modifier import Modifier
-from sysid_btr.objectives.problem import ReplayProblem
 
 LOUD = 1.3
 """Chi2 of a joint's position from which its error is looked at."""
@@ -72,7 +72,7 @@ def proposals(
     Parameters
     ----------
     study : robot and logs.
-    problem, values : data, modifiers and their parameters.
+    problem, values : data, terms and their parameters.
     residual : (r,) whitened, there.
     library : effects that may be asked for.
     """
@@ -109,11 +109,11 @@ def proposals(
 def _within_train(problem: ReplayProblem, values: FloatArray, joint: str, start: float, duration: float) -> bool:
     """Whether a pulse is at the time of one of those that the model already has at this joint."""
     column = 0
-    for modifier in problem.modifiers:
-        own = values[None, column : column + len(modifier.parameters)]
-        column += len(modifier.parameters)
-        if isinstance(modifier, ExternalDisturbanceTrain) and joint in modifier.places:
-            _, first, long, period = modifier.spread(own)[0, modifier.places.index(joint)]
+    for term in problem.terms:
+        own = values[None, column : column + len(term.parameters)]
+        column += len(term.parameters)
+        if isinstance(term, ExternalDisturbanceTrain) and joint in term.places:
+            _, first, long, period = term.spread(own)[0, term.places.index(joint)]
             # since the train's pulse that began last before this one ends
             if (start + duration - first) % period < duration + long:
                 return True
@@ -164,7 +164,7 @@ def spatial_lines(one: MissingTorque) -> list[Line]:
         pairs = [
             one.seen(np.column_stack([np.sin(n * one.position), np.cos(n * one.position)]))[rows] for n in at
         ]
-        return patterns.line_shares(one.torque[rows], pairs, motion)
+        return signal_features.line_shares(one.torque[rows], pairs, motion)
 
     found = shares(numbers)
     if len(found) < 5:
@@ -183,19 +183,19 @@ def spatial_lines(one: MissingTorque) -> list[Line]:
 def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
     """Start (s since the first sample) and duration of the clearest pulse, or None."""
     motion, shortest = _of_motion(one), max(round(SHORTEST_PULSE / one.period), 2)
-    first = patterns.best_box(without(one.torque, motion), shortest)
+    first = signal_features.best_box(without(one.torque, motion), shortest)
     if first is None:
         return None
     # what the motion explains is told by the rest of the log, else it takes a part of the pulse
     rest = without(one.torque, motion, told_by=first.outside(len(motion)))
-    box = patterns.best_box(rest, shortest)
+    box = signal_features.best_box(rest, shortest)
     if box is None:
         return None
     outside = box.outside(len(rest))
     others = rest[outside] - np.median(rest[outside])
     noise = max(1.4826 * float(np.median(np.abs(others))), one.noise)
     length = box.stop - box.start
-    if box.height**2 * length < CLEAR * noise**2 * max(min(patterns.memory(others), length), 1.0):
+    if box.height**2 * length < CLEAR * noise**2 * max(min(signal_features.memory(others), length), 1.0):
         return None
     return float(one.time[box.start]), length * one.period
 
@@ -203,10 +203,10 @@ def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
 def pulse_train(one: MissingTorque) -> Train | None:
     """Equal pulses at regular intervals that are not the motion's own, or None."""
     rest = without(one.torque, _of_motion(one))
-    period, share = patterns.best_period(rest, one.time, SHORTEST_PERIOD)
+    period, share = signal_features.best_period(rest, one.time, SHORTEST_PERIOD)
     if share < TRAIN_SHARE or _rhythm_of_motion(one, period):
         return None
-    train = _upright(one, patterns.best_train(rest, one.time, period))
+    train = _upright(one, signal_features.best_train(rest, one.time, period))
     return train if train.share >= TRAIN_SHARE else None
 
 
@@ -232,16 +232,16 @@ def _upright(one: MissingTorque, train: Train) -> Train:
 
 
 def _rhythm_of_motion(one: MissingTorque, period: float) -> bool:
-    return patterns.repetition(one.velocity, one.time, period) > OWN_RHYTHM
+    return signal_features.repetition(one.velocity, one.time, period) > OWN_RHYTHM
 
 
-def signature(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -> dict[str, Any]:
+def signature(study: Study, terms: Sequence[Term], values: FloatArray) -> dict[str, Any]:
     """Describe what a model leaves of the training data, as missing torque at the joints.
 
     Parameters
     ----------
     study : robot and logs.
-    modifiers, values : the model, (p,).
+    terms, values : the model, (p,).
 
     Returns
     -------
@@ -251,7 +251,7 @@ def signature(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -
         ``periodic`` or None, and ``dependence``: the share of the missing torque that is predicted from a
         state of the robot on stretches of time left out (a correlation ratio free of the bias of its bins).
     """
-    torques = missing_torques(study.train_problem(modifiers), values, study.scales)
+    torques = missing_torques(study.train_problem(terms), values, study.scales)
     if not torques:
         why = "its base was free, and windows are too short" if study.free else "the replay fails or is too short"
         return {"summary": f"not characterised: {why}", "joints": []}
@@ -338,7 +338,7 @@ def _periodic(one: MissingTorque) -> dict[str, Any] | None:
     size = (np.abs(rest) > OUTLIER * 1.4826 * float(np.median(np.abs(rest)))).astype(float)
     options = []
     for signal, same_sign in ((rest, True), (size, False)):
-        period, share = patterns.best_period(signal, one.time, SHORTEST_PERIOD)
+        period, share = signal_features.best_period(signal, one.time, SHORTEST_PERIOD)
         if share > 0 and not _rhythm_of_motion(one, period):
             options.append((share, same_sign, period, signal))
     if not options:
@@ -349,7 +349,7 @@ def _periodic(one: MissingTorque) -> dict[str, Any] | None:
         share, same_sign, period, signal = options[1]
     if share < TRAIN_SHARE:
         return None
-    train = patterns.best_train(signal, one.time, period)
+    train = signal_features.best_train(signal, one.time, period)
     train = _upright(one, train) if same_sign else train
     on = np.mod(one.time - train.start, train.period) < train.duration
     inside = rest[on] if on.any() else rest
@@ -370,7 +370,7 @@ def _features(
     sign, load, q = _direction(one), one.servo, one.position
 
     def of(x: FloatArray, count: int) -> FloatArray:
-        return hats(x, patterns.even_knots(x, count))
+        return hats(x, signal_features.even_knots(x, count))
 
     yield _Feature("direction", "the sign of the velocity", sign[:, None])
     yield _Feature("load", "the load and the sign of the velocity", np.column_stack([sign, np.abs(load) * sign]))
@@ -414,7 +414,7 @@ def _gain_rhythm(one: MissingTorque) -> float | None:
     for period in periods:
         angle = 2 * np.pi * one.time / period
         pairs.append(one.seen(np.column_stack([load * np.sin(angle), load * np.cos(angle)])))
-    shares = patterns.line_shares(one.torque, pairs, one.seen(load[:, None]))
+    shares = signal_features.line_shares(one.torque, pairs, one.seen(load[:, None]))
     best = int(np.argmax(shares))
     return float(periods[best]) if shares[best] > 0.5 else None
 

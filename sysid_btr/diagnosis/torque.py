@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.effects.base import scale_at
-from sysid_btr.effects.external_disturbance import ExternalDisturbanceTrain
-from sysid_btr.models.scales import Scales
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target
-from sysid_btr.replay.structure import limbs
+from sysid_btr.simulation.subtrees import limbs
+from sysid_btr.terms.effect import scale_at
+from sysid_btr.terms.external_disturbance import ExternalDisturbanceTrain
+from sysid_btr.terms.scales import Scales
 
 MOST_SAMPLES = 8192
 """Longer episodes are averaged down to this many samples."""
@@ -89,8 +89,8 @@ def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) 
 
     Parameters
     ----------
-    problem : data and modifiers.
-    values : (p,) of the modifiers.
+    problem : data and terms.
+    values : (p,) of the terms.
     scales : sizes at the joints.
 
     Returns
@@ -164,7 +164,7 @@ def _deconvolve(
     pulses = np.tile(rest, (1 + depth, 1, 1))
     pulses[:, :, 0] = amounts
     candidates = np.hstack([np.tile(values, (1 + depth, 1)), pulses.reshape(1 + depth, -1)])
-    replay = replace(episode.replay, modifiers=(*episode.replay.modifiers, train), effort=True)
+    replay = replace(episode.replay, terms=(*episode.replay.terms, train), effort=True)
     outputs = replay.predict(candidates)
     predicted = outputs.position[:, :, target.columns]
     if not np.isfinite(predicted).all() or outputs.effort is None:

@@ -29,14 +29,14 @@ from sysid_btr.excite.motion import MARGIN, Clock, Family, as_log, find_motors
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, estimates
 from sysid_btr.identify.study import measure_scales, nominal_start, split_episodes
 from sysid_btr.io.log import Log, LogMeta
-from sysid_btr.models.grammar import parse_parameters
-from sysid_btr.models.modifier import Modifier, Parameter
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
-from sysid_btr.replay.engine import Numerics, Replay
-from sysid_btr.replay.numerics import choose_numerics
+from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import choose_numerics
+from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.terms.grammar import parse_parameters
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -223,14 +223,14 @@ class Experiment:
 
     Attributes
     ----------
-    robot, modifiers : the model and its free parameters, at their nominal values.
+    robot, terms : the model and its free parameters, at their nominal values.
     sensors : what is measured.
     numerics, threads : of the simulation.
     rest : (j,) positions of all joints in which the model rests under the nominal commands.
     """
 
     robot: Robot
-    modifiers: tuple[Modifier, ...]
+    terms: tuple[Term, ...]
     sensors: Sensors
     numerics: Numerics
     threads: int
@@ -242,13 +242,13 @@ class Experiment:
         replay = Replay(
             self.robot,
             replace(log, channels=channels),
-            self.modifiers,
+            self.terms,
             self.numerics,
             effort=self.sensors.effort,
             threads=self.threads,
         )
         targets = self.sensors.targets(log.time, replay.index.joints)
-        return ReplayProblem((Episode(replay, targets),), nominal_start(self.modifiers))
+        return ReplayProblem((Episode(replay, targets),), nominal_start(self.terms))
 
     def of_reference(self, log: Log, seconds: float) -> ReplayProblem:
         """The problem that a reference log poses, as far as `seconds` of it."""
@@ -262,14 +262,14 @@ class Experiment:
             replay = Replay(
                 self.robot.for_log(part),
                 part,
-                self.modifiers,
+                self.terms,
                 self.numerics,
                 effort=self.sensors.effort,
                 threads=self.threads,
             )
             targets = self.sensors.targets(part.time - part.time[0], replay.index.joints)
             episodes.append(Episode(replay, targets))
-        return ReplayProblem(tuple(episodes), nominal_start(self.modifiers))
+        return ReplayProblem(tuple(episodes), nominal_start(self.terms))
 
 
 def prepare(robot: Robot, parameters: Sequence[str], sensors: Sensors, log: Log, *, threads: int = 0) -> Experiment:
@@ -285,8 +285,8 @@ def prepare(robot: Robot, parameters: Sequence[str], sensors: Sensors, log: Log,
     replay = Replay(robot, held, (), numerics, threads=threads)
     last = replay.predict(np.zeros((1, 0))).position[0, -1]
     rest = dict(zip(replay.index.joints, map(float, last), strict=True))
-    modifiers = parse_parameters(parameters, robot, measure_scales(robot, (log,), numerics, threads))
-    return Experiment(robot, modifiers, sensors, numerics, threads, rest)
+    terms = parse_parameters(parameters, robot, measure_scales(robot, (log,), numerics, threads))
+    return Experiment(robot, terms, sensors, numerics, threads, rest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -480,7 +480,7 @@ def cheap(experiment: Experiment, log: Log) -> Experiment:
 def _beyond(robot: Robot, replay: Replay) -> dict[str, float]:
     from sysid_btr.models.robot import joint_ranges
 
-    plain = replace(replay, modifiers=())
+    plain = replace(replay, terms=())
     position = plain.predict(np.zeros((1, 0))).position[0]
     ranges = joint_ranges(robot)
     beyond = {}

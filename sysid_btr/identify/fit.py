@@ -15,17 +15,17 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Te
 from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.floating_base.fusion import weigh_walks
+from sysid_btr.floating_base.walk import Walk
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, Known, estimates, newton
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
-from sysid_btr.identify.walk import Walk
-from sysid_btr.identify.weighing import weigh_walks
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
-from sysid_btr.replay.numerics import held_numerics
+from sysid_btr.simulation.numerics import held_numerics
+from sysid_btr.terms.base import Term
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -53,7 +53,7 @@ class Fit:
     Attributes
     ----------
     study : as fitted; its numerics may have been refined.
-    modifiers : whose parameters were fitted.
+    terms : whose parameters were fitted.
     estimates : one a parameter.
     values : (p,) the estimates' values.
     nominal, before : scores of the plain and of the fitted model on fitted and held-out data.
@@ -66,7 +66,7 @@ class Fit:
     """
 
     study: Study
-    modifiers: tuple[Modifier, ...]
+    terms: tuple[Term, ...]
     estimates: tuple[Estimate, ...]
     values: FloatArray
     nominal: Scores
@@ -86,7 +86,7 @@ class Fit:
 
 def fit(
     study: Study,
-    parameters: Sequence[str] | Sequence[Modifier],
+    parameters: Sequence[str] | Sequence[Term],
     *,
     estimator: Estimator | None = None,
     rng: Generator | None = None,
@@ -101,7 +101,7 @@ def fit(
     Parameters
     ----------
     study : robot and logs.
-    parameters : expressions of the grammar, or modifiers.
+    parameters : expressions of the grammar, or terms.
     estimator : default least squares.
     rng : for estimators that draw; default seed 0.
     budget, journal, progress : see `sysid_btr.estimators`.
@@ -120,15 +120,15 @@ def fit(
         Parameters that the log cannot tell are held at their nominal value and marked.
     """
     began = perf_counter()
-    modifiers = as_modifiers(study, parameters)
+    terms = as_terms(study, parameters)
     estimator = LeastSquares() if estimator is None else estimator
     if study.free and isinstance(estimator, LeastSquares):
         estimator = walking(estimator)
     rng = np.random.default_rng(0) if rng is None else rng
     journal = Journal() if journal is None else journal
-    if any(m.parameters for m in modifiers):
-        study = realise_servo(study, modifiers, start)
-    problem = study.train_problem(modifiers, start)
+    if any(m.parameters for m in terms):
+        study = realise_servo(study, terms, start)
+    problem = study.train_problem(terms, start)
     if not problem.parameters:
         raise UsageError("nothing to fit: free at least one parameter, for example --fit 'mass:*'")
     rough, budget = 0, budget or Budget()
@@ -140,19 +140,19 @@ def fit(
         if isinstance(estimator, LeastSquares):
             rough, estimator = explored.evaluations, walking(estimator) if study.free else estimator
         journal = journal.section()
-        problem = study.train_problem(modifiers, explored.x)
+        problem = study.train_problem(terms, explored.x)
     if isinstance(estimator, LeastSquares):
         # first find how large each column's error is, then weigh the columns by it
         if study.free:
-            study, coarse = settled_refit(study, modifiers, problem.start)
+            study, coarse = settled_refit(study, terms, problem.start)
         else:
-            coarse = refit(study, modifiers, problem.start)
+            coarse = refit(study, terms, problem.start)
         if float(coarse.train_columns.max()) > MISFIT:
             if not study.free:  # windows are weighed one by one already
                 study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
             study = inflate(study, coarse, memory=True)
         rough += coarse.evaluations
-        problem = study.train_problem(modifiers, coarse.values)
+        problem = study.train_problem(terms, coarse.values)
     if distance is not None and isinstance(estimator, LeastSquares):
         raise UsageError("lsq minimises squared residuals: for another distance choose ga, cmaes or nlopt:ALGORITHM")
     if study.free and isinstance(estimator, LeastSquares):
@@ -163,7 +163,7 @@ def fit(
         goal = problem if distance is None else DistanceProblem(problem, distance)
         result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
     replays = result.evaluations + rough
-    step = study.stencil(modifiers)
+    step = study.stencil(terms)
     values, jacobian, residual = _at_optimum(problem, result, step)
     for _ in range(MAX_REFINEMENTS):
         shift = numerics_shift(problem, values, jacobian, residual)
@@ -176,7 +176,7 @@ def fit(
         if study.free or not isinstance(estimator, LeastSquares) or worst <= SHIFT_TOLERATED or digital or misfit > FAR:
             break
         study = replace(study, numerics=study.numerics.halved())
-        problem = study.train_problem(modifiers, values)
+        problem = study.train_problem(terms, values)
         polished = LeastSquares().fit(
             problem, rng=rng, budget=Budget(), journal=Journal(), progress=progress
         )
@@ -194,11 +194,11 @@ def fit(
         values, found, extra = hold_unidentifiable(problem, values, found, jacobian, known)
     return Fit(
         study=study,
-        modifiers=modifiers,
+        terms=terms,
         estimates=found,
         values=values,
-        nominal=score(study, modifiers, nominal_start(modifiers)),
-        before=score(study, modifiers, values),
+        nominal=score(study, terms, nominal_start(terms)),
+        before=score(study, terms, values),
         result=result,
         numerics_shift=shift,
         replays=replays + extra,
@@ -207,7 +207,7 @@ def fit(
     )
 
 
-def realise_servo(study: Study, modifiers: tuple[Modifier, ...], start: FloatArray | None) -> Study:
+def realise_servo(study: Study, terms: tuple[Term, ...], start: FloatArray | None) -> Study:
     """The study with the realisation of a digital servo that fits the log better.
 
     Held torque under a known velocity, or an Euler step a period, which is a velocity from differences.
@@ -218,34 +218,34 @@ def realise_servo(study: Study, modifiers: tuple[Modifier, ...], start: FloatArr
     if held is None:
         return study
     short = shorten(study, SERVO_SECONDS)
-    first = nominal_start(modifiers) if start is None else start
+    first = nominal_start(terms) if start is None else start
     misfit = [
-        float(np.mean(np.log(refit(replace(short, numerics=n), modifiers, first, iterations=4).train_columns)))
+        float(np.mean(np.log(refit(replace(short, numerics=n), terms, first, iterations=4).train_columns)))
         for n in (held, study.numerics)
     ]
     return replace(study, numerics=held) if misfit[0] < misfit[1] - SERVO_MARGIN else study
 
 
-def settled_refit(study: Study, modifiers: tuple[Modifier, ...], start: FloatArray) -> tuple[Study, Fitted]:
+def settled_refit(study: Study, terms: tuple[Term, ...], start: FloatArray) -> tuple[Study, Fitted]:
     """First fit of walks: parameters, and starts of windows, in turn, with a cheap integrator."""
     numerics = study.numerics
     study = replace(study, numerics=study.rough)
-    first = best_start(study, modifiers, contact_starts(modifiers, start))
-    coarse = refit(study, modifiers, first, iterations=5)
-    study = study.settled(modifiers, coarse.values, held=False, anew=False)
-    again = refit(study, modifiers, coarse.values, iterations=3)
-    study = replace(study.settled(modifiers, again.values), numerics=numerics)
+    first = best_start(study, terms, contact_starts(terms, start))
+    coarse = refit(study, terms, first, iterations=5)
+    study = study.settled(terms, coarse.values, held=False, anew=False)
+    again = refit(study, terms, coarse.values, iterations=3)
+    study = replace(study.settled(terms, again.values), numerics=numerics)
     spent = again.evaluations + coarse.evaluations
     if all(isinstance(log, Walk) for log in study.train):
-        return study, judge(study, modifiers, again.values, spent)
+        return study, judge(study, terms, again.values, spent)
     # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model
-    right = refit(study, modifiers, again.values)
+    right = refit(study, terms, again.values)
     return study, replace(right, evaluations=right.evaluations + spent)
 
 
-def contact_starts(modifiers: tuple[Modifier, ...], start: FloatArray) -> FloatArray:
+def contact_starts(terms: tuple[Term, ...], start: FloatArray) -> FloatArray:
     """Starts (k, p) that differ in how stiff the ground is: between a soft and a hard one the loss is not convex."""
-    own = [i for i, p in enumerate(p for m in modifiers for p in m.parameters) if p.name.startswith("foot_compliance")]
+    own = [i for i, p in enumerate(p for m in terms for p in m.parameters) if p.name.startswith("foot_compliance")]
     starts = np.tile(start, (1 + len(STIFFER) * bool(own), 1))
     for row, factor in zip(starts[1:], STIFFER, strict=False):
         row[own] *= factor
@@ -256,9 +256,9 @@ STIFFER = (0.6, 0.35, 0.25)
 """Contact time constants tried first, as factors of the nominal."""
 
 
-def as_modifiers(study: Study, parameters: Sequence[str] | Sequence[Modifier]) -> tuple[Modifier, ...]:
-    """Expressions of the grammar as modifiers; modifiers as they are."""
-    given = tuple(p for p in parameters if isinstance(p, Modifier))
+def as_terms(study: Study, parameters: Sequence[str] | Sequence[Term]) -> tuple[Term, ...]:
+    """Expressions of the grammar as terms; terms as they are."""
+    given = tuple(p for p in parameters if isinstance(p, Term))
     return (*given, *study.declare([p for p in parameters if isinstance(p, str)]))
 
 

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.models.modifier import Parameter
+from sysid_btr.terms.base import Parameter
 
 Identifiable = Literal["yes", "weak", "no"]
 NOT_IDENTIFIABLE = 0.15

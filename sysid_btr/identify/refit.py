@@ -11,13 +11,13 @@ from sysid_btr.estimators.base import Budget, Progress, Termination, silent
 from sysid_btr.estimators.evaluator import Evaluator, Stop
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
+from sysid_btr.floating_base.walk import Walk
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.study import WIDE_STEP, Study
-from sysid_btr.identify.walk import Walk
 from sysid_btr.io.log import Log
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem, of_both
-from sysid_btr.replay.engine import Numerics
+from sysid_btr.simulation.engine import Numerics
+from sysid_btr.terms.base import Term
 
 CORRELATED = 1.5
 """Chi2 of a column beyond which its residual is an error of the model rather than noise."""
@@ -33,7 +33,7 @@ class Fitted:
 
     Attributes
     ----------
-    modifiers, values : the model.
+    terms, values : the model.
     train, holdout : mean square of error over noise floor.
     train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
     memory : integrated autocorrelation, in samples, of each column's fitted residual; 1 if white.
@@ -44,7 +44,7 @@ class Fitted:
     numerics : with which it was judged.
     """
 
-    modifiers: tuple[Modifier, ...]
+    terms: tuple[Term, ...]
     values: FloatArray
     train: float
     holdout: float
@@ -79,7 +79,7 @@ class Fitted:
 
 def refit(
     study: Study,
-    modifiers: tuple[Modifier, ...],
+    terms: tuple[Term, ...],
     start: FloatArray,
     *,
     polish: bool = False,
@@ -96,24 +96,24 @@ def refit(
     KeyboardInterrupt
         The user interrupted; the study's journal, if it has one, holds what was simulated, except to polish.
     """
-    problem = study.train_problem(modifiers, np.clip(start, *_bounds(modifiers)))
+    problem = study.train_problem(terms, np.clip(start, *_bounds(terms)))
     estimator = LeastSquares(
         confirm=polish,
         max_iterations=30 if polish else iterations,
         tolerance=1e-6 if polish else 2e-4,
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
-    structural = any(m.structural for m in modifiers)
+    structural = any(m.structural for m in terms)
     if study.free:
         estimator = walking(estimator)
     elif structural:
-        step = study.stencil(modifiers)
+        step = study.stencil(terms)
         estimator = replace(estimator, forward_step=step, central_step=step)
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
     # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
-    costly = structural or any(type(m).overrides("law") for m in modifiers)
+    costly = structural or any(type(m).overrides("law") for m in terms)
     cheaper = study.free or not (polish or costly)
     if cheaper and study.numerics != study.cheap:
         result = deferred_fit(
@@ -123,15 +123,15 @@ def refit(
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
     if result.termination is Termination.INTERRUPTED:
         raise KeyboardInterrupt
-    return judge(judged or study, modifiers, result.x, evaluations=result.evaluations)
+    return judge(judged or study, terms, result.x, evaluations=result.evaluations)
 
 
-def best_start(study: Study, modifiers: tuple[Modifier, ...], starts: FloatArray) -> FloatArray:
+def best_start(study: Study, terms: tuple[Term, ...], starts: FloatArray) -> FloatArray:
     """The best (p,) of several first guesses (k, p); the first, unless another one is better by more than a trace."""
-    starts = np.clip(starts, *_bounds(modifiers))
+    starts = np.clip(starts, *_bounds(terms))
     if len(starts) == 1:
         return np.asarray(starts[0])
-    problem = study.train_problem(modifiers, starts[0])
+    problem = study.train_problem(terms, starts[0])
     try:
         losses = Evaluator(problem, budget=Budget(), journal=study.section(), progress=silent).loss(starts)
     except Stop:
@@ -161,16 +161,16 @@ def walking(estimator: LeastSquares) -> LeastSquares:
     )
 
 
-def judge(study: Study, modifiers: tuple[Modifier, ...], values: FloatArray, evaluations: int = 0) -> Fitted:
+def judge(study: Study, terms: tuple[Term, ...], values: FloatArray, evaluations: int = 0) -> Fitted:
     """Scores of given values on fitted and held-out data."""
-    train = study.train_problem(modifiers)
-    holdout = study.holdout_problem(modifiers)
+    train = study.train_problem(terms)
+    holdout = study.holdout_problem(terms)
     r, s = of_both(train, holdout, lambda problem: np.asarray(problem.residuals(values[None])[0]))
     train_columns, holdout_columns = _by_column(train, r), _by_column(holdout, s)
     a, b = _counts(train), _counts(holdout)
     same = len(a) == len(b)
     return Fitted(
-        modifiers=modifiers,
+        terms=terms,
         values=values,
         train=float(np.average(train_columns, weights=a)),
         holdout=float(np.average(holdout_columns, weights=b)),
@@ -197,7 +197,7 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     means: Geyer 1992, doi:10.1214/ss/1177011137), which is right for estimates under an error that stays, and
     wrong for finding its cause.
     """
-    problem = study.train_problem(fitted.modifiers)
+    problem = study.train_problem(fitted.terms)
     worst: dict[tuple[str, str, str], float] = {}
     for chi2, length, (i, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
         key = (problem.episodes[i].replay.log.meta.mount, target.channel, target.joints[k])
@@ -212,7 +212,7 @@ def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitt
     for _ in range(rounds):
         before = fitted.train_columns
         study = inflate(study, fitted)
-        again = refit(study, fitted.modifiers, fitted.values)
+        again = refit(study, fitted.terms, fitted.values)
         fitted = replace(again, evaluations=again.evaluations + fitted.evaluations)
         # held-out data must not decide how long is fitted
         if np.all(np.abs(np.log(fitted.train_columns / before)) < 0.02):
@@ -225,7 +225,7 @@ def inflated(study: Study, fitted: Fitted) -> tuple[Study, Fitted]:
     study = inflate(study, fitted)
     if not study.free:  # scores are in noise floors; only starts of windows take up more where columns count less
         return study, fitted
-    return study, judge(study, fitted.modifiers, fitted.values, fitted.evaluations)
+    return study, judge(study, fitted.terms, fitted.values, fitted.evaluations)
 
 
 def _counts(problem: ReplayProblem) -> FloatArray:
@@ -266,8 +266,8 @@ def _by_cell(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     return np.asarray(sums.reshape(-1, width), dtype=np.float64)
 
 
-def _bounds(modifiers: tuple[Modifier, ...]) -> tuple[FloatArray, FloatArray]:
-    parameters = [p for m in modifiers for p in m.parameters]
+def _bounds(terms: tuple[Term, ...]) -> tuple[FloatArray, FloatArray]:
+    parameters = [p for m in terms for p in m.parameters]
     return np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.objectives.targets import COMPARED
+from sysid_btr.terms.base import Term
 
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
@@ -45,12 +45,12 @@ class Scores:
     holdout: Mapping[str, ChannelScore]
 
 
-def score(study: Study, modifiers: Sequence[Modifier], values: FloatArray) -> Scores:
+def score(study: Study, terms: Sequence[Term], values: FloatArray) -> Scores:
     """Score one candidate on every channel that log and model have, fitted or not."""
     from dataclasses import replace
 
     wide = replace(study, channels=COMPARED)
-    fitted, heldout = wide.train_problem(modifiers), wide.holdout_problem(modifiers)
+    fitted, heldout = wide.train_problem(terms), wide.holdout_problem(terms)
     errors = of_both(fitted, heldout, lambda problem: problem.errors(values))
     return Scores(*(_scores(problem, own) for problem, own in zip((fitted, heldout), errors, strict=True)))
 

@@ -12,7 +12,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.walk import (
+from sysid_btr.executors.base import HERE, Executor
+from sysid_btr.floating_base.walk import (
     FASTEST,
     Walk,
     covered,
@@ -25,15 +26,14 @@ from sysid_btr.identify.walk import (
 )
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split
-from sysid_btr.models.grammar import parse_parameters
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot, joint_names
-from sysid_btr.models.scales import JointScale, Scales
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, Target, make_targets
-from sysid_btr.replay.engine import Numerics, Replay, make_index
-from sysid_btr.replay.executor import HERE, Executor
-from sysid_btr.replay.numerics import choose_numerics
+from sysid_btr.simulation.engine import Numerics, Replay, make_index
+from sysid_btr.simulation.numerics import choose_numerics
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.scales import JointScale, Scales
 
 TINY = 1e-9
 WIDE_STEP = 2e-2
@@ -81,38 +81,38 @@ class Study:
         """Sizes of torques and motions at every joint in the plain model on these logs."""
         return measure_scales(self.robot, self.train, self.numerics, self.threads)
 
-    def declare(self, expressions: Sequence[str]) -> tuple[Modifier, ...]:
-        """Modifiers of the parameters that a user frees."""
+    def declare(self, expressions: Sequence[str]) -> tuple[Term, ...]:
+        """Terms of the parameters that a user frees."""
         return parse_parameters(expressions, self.robot, self.scales)
 
-    def train_problem(self, modifiers: Sequence[Modifier], start: FloatArray | None = None) -> ReplayProblem:
+    def train_problem(self, terms: Sequence[Term], start: FloatArray | None = None) -> ReplayProblem:
         """What is fitted."""
         episodes = tuple(
-            self._episode(log, modifiers, self.channels, 0.0, self.train_stop(log)) for log in self.train
+            self._episode(log, terms, self.channels, 0.0, self.train_stop(log)) for log in self.train
         )
-        begin = nominal_start(modifiers) if start is None else start
+        begin = nominal_start(terms) if start is None else start
         return ReplayProblem(episodes, begin, self.executor)
 
-    def holdout_problem(self, modifiers: Sequence[Modifier]) -> ReplayProblem:
+    def holdout_problem(self, terms: Sequence[Term]) -> ReplayProblem:
         """What is predicted without having been fitted."""
         episodes = tuple(
-            self._episode(log, modifiers, self.channels, begin, np.inf)
+            self._episode(log, terms, self.channels, begin, np.inf)
             for log, begin in zip(self.holdout, self.split, strict=True)
         )
-        return ReplayProblem(episodes, nominal_start(modifiers), self.executor)
+        return ReplayProblem(episodes, nominal_start(terms), self.executor)
 
     def train_stop(self, log: Log) -> float:
         return np.inf
 
     def _episode(
-        self, log: Log, modifiers: Sequence[Modifier], channels: tuple[str, ...], begin: float, end: float
+        self, log: Log, terms: Sequence[Term], channels: tuple[str, ...], begin: float, end: float
     ) -> Episode:
         robot = self.robot.for_log(log)
         present = tuple(c for c in channels if any(log.has(c, j) for j in joint_names(robot)))
         if isinstance(log, Walk):
             log = log.only(begin)
         replay = make_replay(
-            robot, log, modifiers, self.numerics, effort="effort" in present, threads=self.threads
+            robot, log, terms, self.numerics, effort="effort" in present, threads=self.threads
         )
         targets = make_targets(log, replay.index.joints, present, 0.0 if isinstance(log, Walk) else WARM_UP)
         if not targets:
@@ -167,14 +167,14 @@ class Study:
             ),
         )
 
-    def stencil(self, modifiers: Sequence[Modifier]) -> float:
+    def stencil(self, terms: Sequence[Term]) -> float:
         """Finite-difference step, fraction of a parameter's range: wide where impacts roughen the objective."""
         if self.free:
             return WIDE_STEP
-        return ROUGH_STEP if any(m.structural for m in modifiers) else LeastSquares.central_step
+        return ROUGH_STEP if any(m.structural for m in terms) else LeastSquares.central_step
 
     def settled(
-        self, modifiers: Sequence[Modifier], values: FloatArray, *, held: bool = True, anew: bool = True
+        self, terms: Sequence[Term], values: FloatArray, *, held: bool = True, anew: bool = True
     ) -> Study:
         """The study with the starts of its windows moved to where the data want them under these parameters.
 
@@ -185,7 +185,7 @@ class Study:
             if not isinstance(log, Walk):
                 return log
             log = log.only(begin)
-            episode = self._episode(log, modifiers, self.channels, begin, np.inf)
+            episode = self._episode(log, terms, self.channels, begin, np.inf)
             return settle(log, episode.replay, episode.targets, values, self.rough, anew=anew)
 
         return replace(
@@ -197,9 +197,9 @@ class Study:
         )
 
 
-def nominal_start(modifiers: Sequence[Modifier]) -> FloatArray:
-    """Nominal values of all parameters of some modifiers."""
-    return np.array([p.nominal for m in modifiers for p in m.parameters])
+def nominal_start(terms: Sequence[Term]) -> FloatArray:
+    """Nominal values of all parameters of some terms."""
+    return np.array([p.nominal for m in terms for p in m.parameters])
 
 
 def make_study(

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sysid_btr.errors import ModelError
-from sysid_btr.models.modifier import Modifier
+from sysid_btr.terms.base import Term
 
 if TYPE_CHECKING:
     import mujoco
 
     from sysid_btr.io.log import Log
-    from sysid_btr.models.fields import FieldModifier
+    from sysid_btr.terms.fields import FieldTerm
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Robot:
     bounds : parameter or ``FIELD`` -> (lower, upper), over the defaults of the grammar.
     priors : parameter, glob or ``FIELD`` -> prior as text, such as ``normal(1, 0.1)``, for posteriors.
     tied : groups of joints driven by one motor; their gains are one parameter.
-    always : modifiers without parameters of their own that belong to the robot (drive electronics).
-    fields : ``FIELD`` -> modifier of the parameters that this robot has beyond those of the grammar.
+    always : terms without parameters of their own that belong to the robot (drive electronics).
+    fields : ``FIELD`` -> term of the parameters that this robot has beyond those of the grammar.
     """
 
     name: str
@@ -41,10 +41,10 @@ class Robot:
     digest: str = ""
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     tied: tuple[tuple[str, ...], ...] = ()
-    always: tuple[Modifier, ...] = ()
+    always: tuple[Term, ...] = ()
     configure: Callable[[Robot, Log], Robot] | None = None
     priors: Mapping[str, str] = field(default_factory=dict)
-    fields: Mapping[str, type[FieldModifier]] = field(default_factory=dict)
+    fields: Mapping[str, type[FieldTerm]] = field(default_factory=dict)
 
     def _repr_html_(self) -> str:
         from sysid_btr.report.notebook import html_of_robot

@@ -16,8 +16,8 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
-from sysid_btr.models.modifier import Modifier, Step
 from sysid_btr.models.robot import Robot, robot_from_spec
+from sysid_btr.terms.base import Step, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -51,7 +51,7 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Supply(Modifier):
+class Supply(Term):
     """Servo torque in proportion to the measured supply voltage, and none while the torque is off.
 
     A log without voltage is taken at the nominal supply, one without flags as always on.

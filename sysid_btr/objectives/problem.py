@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.models.modifier import Modifier, Outputs, Parameter
+from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.objectives.marginal import Marginal, Projection, projections
 from sysid_btr.objectives.targets import Target
-from sysid_btr.replay.engine import Numerics, Replay
-from sysid_btr.replay.executor import HERE, Executor
-from sysid_btr.replay.structure import colour, limbs, parameter_limbs
-from sysid_btr.replay.together import chunks_together, parties
+from sysid_btr.simulation.batching import chunks_together, parties
+from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.subtrees import colour, limbs, parameter_limbs
+from sysid_btr.terms.base import Outputs, Parameter, Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +104,8 @@ class ReplayProblem:
         return self.episodes[0].replay.parameters
 
     @property
-    def modifiers(self) -> tuple[Modifier, ...]:
-        return self.episodes[0].replay.modifiers
+    def terms(self) -> tuple[Term, ...]:
+        return self.episodes[0].replay.terms
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -248,7 +248,7 @@ class ReplayProblem:
         """Limbs each parameter acts on, and the limb of each residual."""
         where = self.where
         of_column = np.array([where[target.joints[k]] for _, target, k in self.columns])
-        return parameter_limbs(self.modifiers, where), of_column[self.column_labels]
+        return parameter_limbs(self.terms, where), of_column[self.column_labels]
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
@@ -261,10 +261,10 @@ class ReplayProblem:
         own = acts_on[parameter]
         return np.isin(limb, list(own)) if own else None
 
-    def with_modifiers(self, modifiers: Sequence[Modifier], start: FloatArray) -> ReplayProblem:
-        """The same data under another set of modifiers."""
+    def with_terms(self, terms: Sequence[Term], start: FloatArray) -> ReplayProblem:
+        """The same data under another set of terms."""
         episodes = tuple(
-            replace(e, replay=replace(e.replay, modifiers=tuple(modifiers))) for e in self.episodes
+            replace(e, replay=replace(e.replay, terms=tuple(terms))) for e in self.episodes
         )
         return ReplayProblem(episodes, start, self.executor)
 
@@ -281,7 +281,7 @@ def of_both(
 
     Parameters
     ----------
-    fitted, heldout : under the same modifiers.
+    fitted, heldout : under the same terms.
     look : gives a number for every residual of a problem.
     """
     pairs = list(zip(fitted.episodes, heldout.episodes, strict=False))
@@ -301,7 +301,7 @@ def _begins(a: Replay, b: Replay) -> bool:
         type(a) is Replay
         and type(b) is Replay
         and n <= len(b.log)
-        and (a.modifiers, a.numerics, a.effort) == (b.modifiers, b.numerics, b.effort)
+        and (a.terms, a.numerics, a.effort) == (b.terms, b.numerics, b.effort)
         and a.log.channels.keys() == b.log.channels.keys()
         and all(np.array_equal(v, b.log.channels[k][:n], equal_nan=True) for k, v in a.log.channels.items())
         and np.array_equal(a.log.time, b.log.time[:n])

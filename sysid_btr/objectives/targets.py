@@ -9,8 +9,8 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import ModelError
-from sysid_btr.models.modifier import Outputs
 from sysid_btr.objectives.noise import NoiseFloor, noise_floor
+from sysid_btr.terms.base import Outputs
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log

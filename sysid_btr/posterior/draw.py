@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
     from sysid_btr.identify.study import Study
-    from sysid_btr.models.modifier import Parameter
+    from sysid_btr.terms.base import Parameter
 
 BUDGET = Budget(evaluations=20_000)
 """Where nothing is said."""
@@ -131,8 +131,8 @@ def posterior(
     began = perf_counter()
     parameters = _parameters(fit)
     chosen = choose_priors(parameters, priors or {}, fit.study.robot.priors)
-    problem = fit.study.train_problem(fit.modifiers, fit.values)
-    x, residual, jacobian, extra = settle(problem, fit.values, fit.study.stencil(fit.modifiers))
+    problem = fit.study.train_problem(fit.terms, fit.values)
+    x, residual, jacobian, extra = settle(problem, fit.values, fit.study.stencil(fit.terms))
     likelihood = make_likelihood(problem, x, residual, jacobian, problem.blocks, fit.numerics_shift)
     drawn = sample(
         replace(problem, start=x),
@@ -145,7 +145,7 @@ def posterior(
         progress=progress,
     )
     values = drawn.flat.mean(axis=0)
-    bands = predict_bands(fit.study, fit.modifiers, drawn.thinned(PREDICTIVE_DRAWS), values)
+    bands = predict_bands(fit.study, fit.terms, drawn.thinned(PREDICTIVE_DRAWS), values)
     return Posterior(
         fit=fit,
         priors=chosen,
@@ -153,7 +153,7 @@ def posterior(
         sample=drawn,
         estimates=_estimates(fit, drawn, jacobian),
         values=values,
-        after=score(fit.study, fit.modifiers, values),
+        after=score(fit.study, fit.terms, values),
         bands=bands,
         coverage=coverage(bands),
         replays=fit.replays + extra + drawn.evaluations + PREDICTIVE_DRAWS,
@@ -162,7 +162,7 @@ def posterior(
 
 
 def _parameters(fit: Fit) -> tuple[Parameter, ...]:
-    return tuple(p for m in fit.modifiers for p in m.parameters)
+    return tuple(p for m in fit.terms for p in m.parameters)
 
 
 def _estimates(fit: Fit, drawn: Sample, jacobian: FloatArray) -> tuple[Estimate, ...]:

@@ -12,8 +12,8 @@ from sysid_btr._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
-    from sysid_btr.models.modifier import Modifier
     from sysid_btr.objectives.problem import ReplayProblem
+    from sysid_btr.terms.base import Term
 
 WIDTH = 1.959963984540054
 """Standard deviations of a 95 % band."""
@@ -63,20 +63,20 @@ class Band:
 
 
 def predict_bands(
-    study: Study, modifiers: Sequence[Modifier], draws: FloatArray, values: FloatArray
+    study: Study, terms: Sequence[Term], draws: FloatArray, values: FloatArray
 ) -> tuple[Band, ...]:
     """Bands of every fitted sensor on every held-out episode.
 
     Parameters
     ----------
-    study, modifiers : as fitted.
+    study, terms : as fitted.
     draws : (m, p) of the posterior; those that diverge are left out.
     values : (p,) at which the fitted model's error is measured.
     """
-    error = _fitted_error(study.train_problem(modifiers), values)
+    error = _fitted_error(study.train_problem(terms), values)
     bands = []
     several = len(study.holdout) > 1
-    for log, episode in zip(study.holdout, study.holdout_problem(modifiers).episodes, strict=True):
+    for log, episode in zip(study.holdout, study.holdout_problem(terms).episodes, strict=True):
         sums = [np.zeros((3, *t.mask.shape)) for t in episode.targets]
         for _, outputs in episode.replay.chunks(draws):
             for total, target in zip(sums, episode.targets, strict=True):

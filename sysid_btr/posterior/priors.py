@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.models.modifier import Parameter
+from sysid_btr.terms.base import Parameter
 
 _POINTS = 4001
 

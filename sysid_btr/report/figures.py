@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
-    from sysid_btr.models.modifier import Modifier
+    from sysid_btr.terms.base import Term
 
 JOINTS_SHOWN = 3
 EPISODES_SEARCHED = 8
@@ -68,8 +68,8 @@ class Trace:
         return float(np.sqrt(np.mean(residual**2)) / self.noise) if len(residual) else 0.0
 
 
-Named = tuple[str, tuple["Modifier", ...], FloatArray]
-"""A model to draw: its name, its modifiers and their values."""
+Named = tuple[str, tuple["Term", ...], FloatArray]
+"""A model to draw: its name, its terms and their values."""
 
 
 def trace_outcome(outcome: Fit | Closing) -> tuple[Trace, ...]:
@@ -82,18 +82,18 @@ def trace_outcome(outcome: Fit | Closing) -> tuple[Trace, ...]:
     from sysid_btr.identify.study import nominal_start
 
     if isinstance(outcome, Fit):
-        start = nominal_start(outcome.modifiers)
+        start = nominal_start(outcome.terms)
         models: tuple[Named, ...] = (
-            ("plain model", outcome.modifiers, start),
-            ("fitted", outcome.modifiers, outcome.values),
+            ("plain model", outcome.terms, start),
+            ("fitted", outcome.terms, outcome.values),
         )
         return trace(outcome.study, models, "plain model")
     models = (
         ("plain model", (), np.zeros(0)),
-        ("parameters fitted", outcome.before_modifiers, outcome.before_values),
+        ("parameters fitted", outcome.before_terms, outcome.before_values),
     )
     if outcome.effects:
-        models = (*models, ("effects added", outcome.modifiers, outcome.values))
+        models = (*models, ("effects added", outcome.terms, outcome.values))
     return trace(outcome.study, models, "parameters fitted")
 
 
@@ -103,8 +103,8 @@ def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, .
     several = len(study.holdout) > 1
     count = min(len(study.holdout), EPISODES_SEARCHED)
     predicted: list[dict[str, FloatArray]] = [{} for _ in range(count)]
-    for name, modifiers, values in models:
-        for i, episode in enumerate(study.holdout_problem(modifiers).episodes[:count]):
+    for name, terms, values in models:
+        for i, episode in enumerate(study.holdout_problem(terms).episodes[:count]):
             predicted[i][name] = episode.replay.predict(values[None]).position[0]
     plain = study.holdout_problem(())
     for i, episode in enumerate(plain.episodes[:count]):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.models.modifier import Modifier
+from sysid_btr.terms.base import Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -89,7 +89,7 @@ def save_pictures(folder: Folder, outcome: Fit | Closing) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Backdrop(Modifier):
+class Backdrop(Term):
     """Light, and a sky for models that have none."""
 
     name: ClassVar[str] = "backdrop"
@@ -119,7 +119,7 @@ def scene_of(outcome: Fit | Closing) -> Scene:
     Joints that the log does not show stand as the final model has them; a free base stands where the model has
     it.
     """
-    from sysid_btr.replay.engine import compile_model, make_index
+    from sysid_btr.simulation.engine import compile_model, make_index
     from sysid_btr.writeback.write import identified
 
     final = identified(outcome)
@@ -130,7 +130,7 @@ def scene_of(outcome: Fit | Closing) -> Scene:
         model = compile_model(robot, log, (Backdrop(places=()),), study.numerics)
         index = make_index(model)
         before = _predicted(study, (), np.zeros(0), i)
-        after = _predicted(study, final.modifiers, final.values, i)
+        after = _predicted(study, final.terms, final.values, i)
         logged = np.column_stack(
             [_filled(log.channels.get(f"position.{j}"), after[:, k]) for k, j in enumerate(index.joints)]
         )
@@ -146,9 +146,9 @@ def scene_of(outcome: Fit | Closing) -> Scene:
     return best
 
 
-def _predicted(study: Study, modifiers: Sequence[Modifier], values: FloatArray, episode: int) -> FloatArray:
+def _predicted(study: Study, terms: Sequence[Term], values: FloatArray, episode: int) -> FloatArray:
     """Positions (n, joints) of one held-out episode under a model; bridged where it is not predicted."""
-    replay = study.holdout_problem(modifiers).episodes[episode].replay
+    replay = study.holdout_problem(terms).episodes[episode].replay
     found = replay.predict(values[None]).position[0]
     return np.column_stack([_filled(column, np.zeros(len(column))) for column in found.T])
 

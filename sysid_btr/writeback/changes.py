@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
-from sysid_btr.models.modifier import LINK_SUFFIX
+from sysid_btr.terms.base import LINK_SUFFIX
 from sysid_btr.units import with_digits_of
 from sysid_btr.writeback.features import INTEGRATORS, Feature, Kind, count, differ, of_kind
 from sysid_btr.writeback.native import Part
@@ -34,7 +34,7 @@ class Change:
     ----------
     kind, name, attribute : which; a servo's gains are ``kp``, ``kv``, ``gain`` and ``bias``.
     before, after : numbers, or the word of an option; empty before for what was added.
-    by : modifiers that ask for it.
+    by : terms that ask for it.
     certainty : half of the 95 % interval of what it was estimated from, in brackets; empty where unknown.
     line : the change in one line.
     """
@@ -51,7 +51,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Stated:
-    """A modifier with the estimates of its parameters."""
+    """A term with the estimates of its parameters."""
 
     part: Part
     fields: frozenset[str]
@@ -64,16 +64,16 @@ class Stated:
 
     def of(self, place: str) -> tuple[Estimate, ...]:
         """Estimates at a place."""
-        modifier = self.part.modifier
-        kinds = len(modifier.kinds)
+        term = self.part.term
+        kinds = len(term.kinds)
         if not self.estimates or not kinds:
             return ()
-        group = 0 if len(modifier.groups) == 1 else modifier.places.index(place)
+        group = 0 if len(term.groups) == 1 else term.places.index(place)
         return self.estimates[group * kinds : (group + 1) * kinds]
 
     def acts_at(self, place: str) -> bool:
         """Whether a place is one of its own."""
-        return place in self.part.modifier.places or self.part.modifier.places == ("robot",)
+        return place in self.part.term.places or self.part.term.places == ("robot",)
 
 
 def changes_of(before: mujoco.MjModel, target: Target, estimates: Sequence[tuple[Estimate, ...]]) -> tuple[Change, ...]:
@@ -115,7 +115,7 @@ def _of_kind(kind: Kind, before: mujoco.MjModel, after: mujoco.MjModel, stated: 
             by = [s for s in stated if s.acts_at(place) and s.fields & set(feature.fields)]
             by = by or [s for s in stated if s.acts_at(place) and s.structural and kind != "option"]
             for attribute, old, new in _values(feature, before, i, after, j):
-                called = [s for s in by if s.part.modifier.name == attribute]
+                called = [s for s in by if s.part.term.name == attribute]
                 yield _change(kind, name, place, attribute, old, new, called or by, set(feature.fields))
 
 
@@ -126,7 +126,7 @@ def _differ(feature: Feature, before: mujoco.MjModel, i: int, after: mujoco.MjMo
 
 
 def _place(model: mujoco.MjModel, kind: Kind, i: int) -> tuple[str, str]:
-    """Name for people, and the joint or body that a modifier would call it by."""
+    """Name for people, and the joint or body that a term would call it by."""
     if kind == "option":
         return "", "robot"
     name = str(getattr(model, kind)(i).name)
@@ -176,7 +176,7 @@ def _size(values: FloatArray) -> int:
 
 
 def _added(kind: Kind, name: str, place: str, by: Sequence[Stated]) -> Change:
-    names = tuple(s.part.modifier.name for s in by)
+    names = tuple(s.part.term.name for s in by)
     why = "; ".join(describe(s.part, place) for s in by)
     return Change(kind, name, "", "", "", names, "", f"{kind} {name} added" + (f": {why}" if why else ""))
 
@@ -192,16 +192,16 @@ def _change(
     fields: set[str],
 ) -> Change:
     # where another element stands in for a parameter, or makes room for it, its numbers are not the parameter's
-    others = [s for s in by if s.part.stand_in is not s.part.modifier or not s.fields & fields]
+    others = [s for s in by if s.part.stand_in is not s.part.term or not s.fields & fields]
     known = by[0].of(place) if len(by) == 1 else ()
     tail = _stands_for(others[0].part, place) if others else _certainty(known, before, after)
     what = " ".join(part for part in (kind, name, attribute) if part)
     line = f"{what} {_text(before)} -> {_text(after)}{tail}"
-    return Change(kind, name, attribute, before, after, tuple(s.part.modifier.name for s in by), tail, line)
+    return Change(kind, name, attribute, before, after, tuple(s.part.term.name for s in by), tail, line)
 
 
 def _stands_for(part: Part, place: str) -> str:
-    at = place if place in part.modifier.places else part.modifier.places[0]
+    at = place if place in part.term.places else part.term.places[0]
     return f" ({called(part)}: {amounts(part, at)})"
 
 
@@ -226,9 +226,9 @@ def _certainty(estimates: tuple[Estimate, ...], before: tuple[float, ...] | str,
 
 
 def describe(part: Part, place: str | None = None) -> str:
-    """A modifier with its values, at one of its places or at all of them."""
-    modifier = part.modifier
-    places = (place,) if place in modifier.places else modifier.places
+    """A term with its values, at one of its places or at all of them."""
+    term = part.term
+    places = (place,) if place in term.places else term.places
     groups: dict[str, list[str]] = {}
     for at in places:
         groups.setdefault(amounts(part, at), []).append(at)
@@ -238,19 +238,19 @@ def describe(part: Part, place: str | None = None) -> str:
 
 
 def called(part: Part) -> str:
-    """Name of a modifier, with its variant."""
-    variant = getattr(part.modifier, "variant", "")
-    return f"{part.modifier.name} ({variant})" if variant else part.modifier.name
+    """Name of a term, with its variant."""
+    variant = getattr(part.term, "variant", "")
+    return f"{part.term.name} ({variant})" if variant else part.term.name
 
 
 def amounts(part: Part, place: str) -> str:
-    """Values of a modifier at a place, with units."""
-    modifier = part.modifier
-    if not modifier.kinds:
+    """Values of a term at a place, with units."""
+    term = part.term
+    if not term.kinds:
         return ""
-    row = part.values[0, modifier.places.index(place)]
-    units = [p.unit for p in modifier.parameters[: len(modifier.kinds)]]
+    row = part.values[0, term.places.index(place)]
+    units = [p.unit for p in term.parameters[: len(term.kinds)]]
     return ", ".join(
         f"{kind.name} {value:.6g}" + ("" if unit == "1" else f" {unit}")
-        for kind, value, unit in zip(modifier.kinds, row, units, strict=True)
+        for kind, value, unit in zip(term.kinds, row, units, strict=True)
     )

@@ -237,7 +237,7 @@ def _make_features() -> Iterator[Feature]:
 
 
 FEATURES: tuple[Feature, ...] = tuple(_make_features())
-"""All that a modifier of this package may change, in the order in which it is reported."""
+"""All that a term of this package may change, in the order in which it is reported."""
 
 WRITTEN = frozenset(name for feature in FEATURES for name in feature.fields)
 """Compiled fields that a file states."""

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.models.modifier import Modifier, Rig
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.replay.engine import LIFT
-from sysid_btr.replay.quiet import quiet
-from sysid_btr.replay.windows import LEAD, WindowReplay
+from sysid_btr.simulation.engine import LIFT
+from sysid_btr.simulation.segments import LEAD, WindowReplay
+from sysid_btr.simulation.silence import quiet
+from sysid_btr.terms.base import Rig, Term
 from sysid_btr.writeback.rewrite import unequal
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FilledBuffers(Modifier):
+class FilledBuffers(Term):
     """Delayed actuators begin with the commands before the start as their past, instead of with zeros.
 
     Attributes
@@ -68,7 +68,7 @@ def of_file(problem: ReplayProblem, path: Path) -> ReplayProblem:
     for episode in problem.episodes:
         was = episode.replay
         lead = round(LEAD / was.numerics.timestep) if isinstance(was, WindowReplay) else 0
-        replay = replace(was, robot=robot, modifiers=(FilledBuffers(places=(), lead=lead),))
+        replay = replace(was, robot=robot, terms=(FilledBuffers(places=(), lead=lead),))
         episodes.append(replace(episode, replay=replay))
     return ReplayProblem(tuple(episodes), np.zeros(0))
 

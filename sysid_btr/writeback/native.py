@@ -1,4 +1,4 @@
-"""What MuJoCo's own elements hold of modifiers that change more than fields, and what they cannot hold."""
+"""What MuJoCo's own elements hold of terms that change more than fields, and what they cannot hold."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from math import ceil
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.effects.command_delay import CommandDelay
-from sysid_btr.effects.constant_force import ConstantForce
-from sysid_btr.effects.encoder_offset import EncoderOffsetInLoop
-from sysid_btr.effects.payload import Payload
-from sysid_btr.models.fields import ConstantForce as ConstantForceField
-from sysid_btr.models.fields import Delay
-from sysid_btr.models.modifier import Modifier, Rig
+from sysid_btr.terms.base import Rig, Term
+from sysid_btr.terms.command_delay import CommandDelay
+from sysid_btr.terms.constant_force import ConstantForce
+from sysid_btr.terms.encoder_offset import EncoderOffsetInLoop
+from sysid_btr.terms.fields import ConstantForce as ConstantForceField
+from sysid_btr.terms.fields import Delay
+from sysid_btr.terms.payload import Payload
 
 if TYPE_CHECKING:
     import mujoco
 
-    from sysid_btr.replay.engine import Numerics
+    from sysid_btr.simulation.engine import Numerics
 
 Held = Literal["yes", "approximately", "no"]
 SOFT = 1e-10
@@ -32,54 +32,54 @@ REASONS: Mapping[str, str] = {
     "initial_state": "where this log's replay starts",
     "read_out": "a change of what the sensor shows",
 }
-"""Hook of a modifier -> what it is, where MJCF has no element for it."""
+"""Hook of a term -> what it is, where MJCF has no element for it."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A modifier as a file holds it.
+    """A term as a file holds it.
 
     Attributes
     ----------
-    modifier, values : as replayed; values are (1, places, kinds).
+    term, values : as replayed; values are (1, places, kinds).
     stand_in : what writes it into a model in the file's way, None for what leaves no trace.
     held : whether the file then moves as the replay did.
     how : what the file has in its place, or why it has not, in words.
     """
 
-    modifier: Modifier
+    term: Term
     values: FloatArray
-    stand_in: Modifier | None
+    stand_in: Term | None
     held: Held
     how: str
 
 
-def part_of(modifier: Modifier, values: FloatArray, numerics: Numerics, later: tuple[Modifier, ...]) -> Part:
-    """How a file holds one modifier.
+def part_of(term: Term, values: FloatArray, numerics: Numerics, later: tuple[Term, ...]) -> Part:
+    """How a file holds one term.
 
     Parameters
     ----------
-    modifier, values : as replayed.
+    term, values : as replayed.
     numerics : integrator and step of the file.
-    later : modifiers that act after it.
+    later : terms that act after it.
     """
-    native = NATIVE.get(type(modifier))
-    found = None if native is None else native(modifier, values[0], numerics, later)
+    native = NATIVE.get(type(term))
+    found = None if native is None else native(term, values[0], numerics, later)
     if found is not None:
         stand_in, held, how = found
-        return Part(modifier, values, stand_in, held, how)
-    hooks = [reason for hook, reason in REASONS.items() if type(modifier).overrides(hook)]
+        return Part(term, values, stand_in, held, how)
+    hooks = [reason for hook, reason in REASONS.items() if type(term).overrides(hook)]
     if not hooks:
-        return Part(modifier, values, modifier, "yes", "")
-    fields = type(modifier).overrides("write_fields") or type(modifier).overrides("edit_spec")
-    return Part(modifier, values, modifier if fields else None, "no", " and ".join(hooks))
+        return Part(term, values, term, "yes", "")
+    fields = type(term).overrides("write_fields") or type(term).overrides("edit_spec")
+    return Part(term, values, term if fields else None, "no", " and ".join(hooks))
 
 
-Found = tuple[Modifier | None, Held, str] | None
+Found = tuple[Term | None, Held, str] | None
 
 
 @dataclass(frozen=True)
-class AddedBody(Modifier):
+class AddedBody(Term):
     """A payload as a body of its own, welded to the one that carries it."""
 
     loads: tuple[tuple[float, ...], ...] = ()
@@ -102,18 +102,18 @@ class AddedBody(Modifier):
                 rig.array("body_inertia")[:, body] = inertia
 
 
-def _payload(modifier: Modifier, values: FloatArray, _: Numerics, later: tuple[Modifier, ...]) -> Found:
-    if any(set(modifier.places) & set(m.places) and m.name in BODY_FIELDS for m in later):
+def _payload(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
+    if any(set(term.places) & set(m.places) and m.name in BODY_FIELDS for m in later):
         return None  # what follows changes body and load together
     loads = tuple(tuple(float(x) for x in row) for row in values)
-    return AddedBody(places=modifier.places, loads=loads), "yes", "a body of its own"
+    return AddedBody(places=term.places, loads=loads), "yes", "a body of its own"
 
 
 BODY_FIELDS = ("mass", "com", "inertia", "com_offset", "payload")
 
 
 @dataclass(frozen=True)
-class ActuatorDelay(Modifier):
+class ActuatorDelay(Term):
     """Delay of commands by MuJoCo's own buffer.
 
     A held command that is delayed by a fraction of a step counts with its mean over each step; linear
@@ -139,13 +139,13 @@ class ActuatorDelay(Modifier):
                     actuator.interp = 1
 
 
-def _delay(modifier: Modifier, values: FloatArray, numerics: Numerics, later: tuple[Modifier, ...]) -> Found:
-    if any(_reshapes(m) and set(m.places) & set(modifier.places) for m in later):
+def _delay(term: Term, values: FloatArray, numerics: Numerics, later: tuple[Term, ...]) -> Found:
+    if any(_reshapes(m) and set(m.places) & set(term.places) for m in later):
         return None
     stated = [_buffered(float(d), numerics) for d in values[:, 0]]
     if not any(delay for delay, _ in stated):
         return None
-    stand_in = ActuatorDelay(places=modifier.places, delays=tuple(d for d, _ in stated), timestep=numerics.timestep)
+    stand_in = ActuatorDelay(places=term.places, delays=tuple(d for d, _ in stated), timestep=numerics.timestep)
     if all(exact for _, exact in stated):
         return stand_in, "yes", "the actuator's own delay"
     how = "the actuator's own delay, to the whole step where it is shorter than one and a half"
@@ -154,9 +154,9 @@ def _delay(modifier: Modifier, values: FloatArray, numerics: Numerics, later: tu
     return stand_in, "approximately", how
 
 
-def _reshapes(modifier: Modifier) -> bool:
+def _reshapes(term: Term) -> bool:
     """Whether it changes commands in a way that does not commute with a delay, as a constant shift does."""
-    return type(modifier).overrides("shape_command") and not isinstance(modifier, EncoderOffsetInLoop)
+    return type(term).overrides("shape_command") and not isinstance(term, EncoderOffsetInLoop)
 
 
 def _buffered(delay: float, numerics: Numerics) -> tuple[float, bool]:
@@ -172,7 +172,7 @@ def _buffered(delay: float, numerics: Numerics) -> tuple[float, bool]:
 
 
 @dataclass(frozen=True)
-class SoftSpring(Modifier):
+class SoftSpring(Term):
     """A constant torque as a spring that is too long to notice the motion."""
 
     torques: tuple[float, ...] = ()
@@ -192,16 +192,16 @@ class SoftSpring(Modifier):
                 rest[:, at] += torque / k
 
 
-def _constant(modifier: Modifier, values: FloatArray, _: Numerics, later: tuple[Modifier, ...]) -> Found:
+def _constant(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
     if any(m.name in ("stiffness", "joint_spring") for m in later):
         return None
     torques = tuple(float(t) for t in values[:, 0])
     how = "a spring on the joint, so soft and so long that its torque is constant"
-    return SoftSpring(places=modifier.places, torques=torques), "yes", how
+    return SoftSpring(places=term.places, torques=torques), "yes", how
 
 
 @dataclass(frozen=True)
-class ShiftedJoint(Modifier):
+class ShiftedJoint(Term):
     """A joint whose angle is what its encoder shows: the zero of the angle is shifted, not the robot."""
 
     offsets: tuple[float, ...] = ()
@@ -219,15 +219,15 @@ class ShiftedJoint(Modifier):
                 limits[:, joint] += offset
 
 
-def _reference(modifier: Modifier, values: FloatArray, _: Numerics, later: tuple[Modifier, ...]) -> Found:
+def _reference(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
     if any(m.name in ("joint_spring", "encoder_scale") for m in later):
         return None
     offsets = tuple(float(b) for b in values[:, 0])
-    return ShiftedJoint(places=modifier.places, offsets=offsets), "yes", "the joint's reference angle"
+    return ShiftedJoint(places=term.places, offsets=offsets), "yes", "the joint's reference angle"
 
 
-Native = Callable[["Modifier", FloatArray, "Numerics", "tuple[Modifier, ...]"], Found]
-NATIVE: Mapping[type[Modifier], Native] = {
+Native = Callable[["Term", FloatArray, "Numerics", "tuple[Term, ...]"], Found]
+NATIVE: Mapping[type[Term], Native] = {
     Payload: _payload,
     CommandDelay: _delay,
     Delay: _delay,
@@ -235,4 +235,4 @@ NATIVE: Mapping[type[Modifier], Native] = {
     ConstantForceField: _constant,
     EncoderOffsetInLoop: _reference,
 }
-"""Modifiers for which MuJoCo has an element of its own, though the replay goes another way."""
+"""Terms for which MuJoCo has an element of its own, though the replay goes another way."""

@@ -13,12 +13,12 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.models.modifier import Modifier, Parameter
 from sysid_btr.session import PARAMS
+from sysid_btr.terms.base import Parameter, Term
 
 if TYPE_CHECKING:
     from sysid_btr.models.robot import Robot
-    from sysid_btr.replay.engine import Numerics
+    from sysid_btr.simulation.engine import Numerics
 
 PARAMS_SCHEMA = "sysid_btr.params/1"
 
@@ -29,18 +29,18 @@ class Params:
 
     Attributes
     ----------
-    modifiers, values : the model, effects included.
+    terms, values : the model, effects included.
     numerics : with which it was replayed.
     """
 
-    modifiers: tuple[Modifier, ...]
+    terms: tuple[Term, ...]
     values: FloatArray
     numerics: Numerics
 
     @property
     def by_name(self) -> dict[str, float]:
         """Parameter name -> value."""
-        names = (p.name for m in self.modifiers for p in m.parameters)
+        names = (p.name for m in self.terms for p in m.parameters)
         return dict(zip(names, (float(v) for v in self.values), strict=True))
 
 
@@ -52,7 +52,7 @@ def read_params(path: Path, robot: Robot) -> Params:
     UsageError
         If it cannot be read, or names what this robot or this version does not have; all of it at once.
     """
-    from sysid_btr.replay.engine import Numerics
+    from sysid_btr.simulation.engine import Numerics
 
     file = path / PARAMS if path.is_dir() else path
     try:
@@ -64,14 +64,14 @@ def read_params(path: Path, robot: Robot) -> Params:
     if not isinstance(content, dict) or content.get("schema") != PARAMS_SCHEMA:
         raise UsageError(f"--params {file} is no parameter file ({PARAMS_SCHEMA}); give the params.json of a run")
     problems: list[str] = []
-    modifiers: list[Modifier] = []
+    terms: list[Term] = []
     values: list[float] = []
     try:
         places = _places(robot)
         for entry in content["modifiers"]:
-            modifier = _modifier(entry, places, problems, robot)
-            if modifier is not None:
-                modifiers.append(modifier)
+            term = _modifier(entry, places, problems, robot)
+            if term is not None:
+                terms.append(term)
                 values += [float(p["value"]) for p in entry["parameters"]]
         numerics = Numerics(str(content["numerics"]["integrator"]), float(content["numerics"]["timestep"]))
     except (KeyError, TypeError, ValueError) as error:
@@ -80,7 +80,7 @@ def read_params(path: Path, robot: Robot) -> Params:
         ) from error
     if problems:
         raise UsageError(f"--params {file}:\n" + "\n".join(f"  {p}" for p in problems))
-    return Params(tuple(modifiers), np.array(values), numerics)
+    return Params(tuple(terms), np.array(values), numerics)
 
 
 def _places(robot: Robot) -> Mapping[str, Sequence[str]]:
@@ -96,9 +96,9 @@ def _places(robot: Robot) -> Mapping[str, Sequence[str]]:
 
 def _modifier(
     entry: Mapping[str, Any], places: Mapping[str, Sequence[str]], problems: list[str], robot: Robot
-) -> Modifier | None:
-    from sysid_btr.effects.library import EFFECTS
-    from sysid_btr.models.fields import FIELDS
+) -> Term | None:
+    from sysid_btr.terms.fields import FIELDS
+    from sysid_btr.terms.library import EFFECTS
 
     name, variant, where = str(entry["name"]), str(entry["variant"]), tuple(entry["where"])
     if entry["kind"] == "parameter":
@@ -113,7 +113,7 @@ def _modifier(
         problems.append(f"{name}: the model has no {found.scope} {', '.join(unknown)}")
         return None
     known = tuple(_parameter(p) for p in entry["parameters"])
-    bare: Modifier = found(places=where, shared=bool(entry["shared"]))
+    bare: Term = found(places=where, shared=bool(entry["shared"]))
     if len(known) != len(bare.parameters):
         kinds = ", ".join(k.name for k in bare.kinds)
         problems.append(

@@ -103,7 +103,7 @@ def compile_text(text: bytes) -> Compiled:
     """
     import mujoco
 
-    from sysid_btr.replay.quiet import quiet
+    from sysid_btr.simulation.silence import quiet
 
     root = parse(text)
     named: dict[Kind, dict[str, Element]] = {k: {} for k in ("body", "joint", "geom", "actuator", "tendon")}

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.models.modifier import Modifier, Rig
 from sysid_btr.models.robot import Robot
-from sysid_btr.replay.engine import Numerics, compile_model, make_index
-from sysid_btr.replay.quiet import quiet
+from sysid_btr.simulation.engine import Numerics, compile_model, make_index
+from sysid_btr.simulation.silence import quiet
+from sysid_btr.terms.base import Rig, Term
 from sysid_btr.writeback.features import WRITTEN
 from sysid_btr.writeback.native import Part, part_of
 
@@ -29,7 +29,7 @@ class Target:
     Attributes
     ----------
     model : compiled, with its free joint even where the log's robot was held.
-    parts : every modifier as the file holds it.
+    parts : every term as the file holds it.
     fields : compiled fields that each part changes.
     """
 
@@ -38,18 +38,18 @@ class Target:
     fields: tuple[frozenset[str], ...]
 
 
-def make_parts(robot: Robot, modifiers: Sequence[Modifier], values: FloatArray, numerics: Numerics) -> tuple[Part, ...]:
-    """How a file holds each modifier that is not neutral; those of the robot itself come first."""
-    everything = (*robot.always, *modifiers)
+def make_parts(robot: Robot, terms: Sequence[Term], values: FloatArray, numerics: Numerics) -> tuple[Part, ...]:
+    """How a file holds each term that is not neutral; those of the robot itself come first."""
+    everything = (*robot.always, *terms)
     parts, column = [], 0
-    for i, modifier in enumerate(everything):
-        count = len(modifier.parameters)
+    for i, term in enumerate(everything):
+        count = len(term.parameters)
         own = values[column : column + count]
         column += count
-        neutral = count > 0 and np.array_equal(own, [p.nominal for p in modifier.parameters])
-        if neutral and not type(modifier).overrides("edit_spec"):
+        neutral = count > 0 and np.array_equal(own, [p.nominal for p in term.parameters])
+        if neutral and not type(term).overrides("edit_spec"):
             continue
-        parts.append(part_of(modifier, modifier.spread(own[None]), numerics, everything[i + 1 :]))
+        parts.append(part_of(term, term.spread(own[None]), numerics, everything[i + 1 :]))
     return tuple(parts)
 
 

@@ -12,14 +12,14 @@ import numpy as np
 
 from sysid_btr import __version__
 from sysid_btr._typing import FloatArray
-from sysid_btr.effects.base import Effect
 from sysid_btr.errors import ModelError, SysidError
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import Study
-from sysid_btr.models.modifier import Modifier
 from sysid_btr.models.robot import Robot
 from sysid_btr.result import clean, model_entry, to_json
 from sysid_btr.session import MODEL, PARAMS, Folder
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.effect import Effect
 from sysid_btr.writeback.changes import SOLVER, Change, changes_of, describe
 from sysid_btr.writeback.features import Kind
 from sysid_btr.writeback.filed import loss_of, of_file, stands_alone
@@ -47,14 +47,14 @@ class Identified:
     Attributes
     ----------
     study : robot, logs, numerics.
-    modifiers, values : the model.
+    terms, values : the model.
     estimates : of its parameters, in order.
     held_back : names of parameters that the log cannot tell and that stay at their nominal value although the
         search had moved them.
     """
 
     study: Study
-    modifiers: tuple[Modifier, ...]
+    terms: tuple[Term, ...]
     values: FloatArray
     estimates: tuple[Estimate, ...]
     held_back: tuple[str, ...]
@@ -63,7 +63,7 @@ class Identified:
     def written(self) -> FloatArray:
         """(p,) values as they are written."""
         known = {e.name: e for e in self.estimates}
-        names = [p.name for m in self.modifiers for p in m.parameters]
+        names = [p.name for m in self.terms for p in m.parameters]
         return np.array(
             [known[n].nominal if n in self.held_back else v for n, v in zip(names, self.values, strict=True)]
         )
@@ -74,20 +74,20 @@ def identified(outcome: Fit | Closing) -> Identified:
     from sysid_btr.identify.fit import Fit
 
     if isinstance(outcome, Fit):
-        modifiers, values, estimates = outcome.modifiers, outcome.values, outcome.estimates
+        terms, values, estimates = outcome.terms, outcome.values, outcome.estimates
     elif outcome.effects:
-        modifiers, values = outcome.modifiers, outcome.values
+        terms, values = outcome.terms, outcome.values
         estimates = (*outcome.parameters, *(p for e in outcome.effects for p in e.parameters))
     else:
-        modifiers, values = outcome.before_modifiers, outcome.before_values
+        terms, values = outcome.before_terms, outcome.before_values
         estimates = tuple(replace(e, value=float(v)) for e, v in zip(outcome.parameters, values, strict=True))
-    declared = sum(len(m.parameters) for m in modifiers if not isinstance(m, Effect))
+    declared = sum(len(m.parameters) for m in terms if not isinstance(m, Effect))
     held_back = tuple(
         e.name
         for e, v in zip(estimates[:declared], values[:declared], strict=True)
         if e.identifiable == "no" and v != e.nominal
     )
-    return Identified(outcome.study, tuple(modifiers), np.asarray(values), estimates, held_back)
+    return Identified(outcome.study, tuple(terms), np.asarray(values), estimates, held_back)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ def draft(model: Identified) -> Draft:
 
 def _parts(model: Identified) -> tuple[Part, ...]:
     robot = model.study.robot.for_log(model.study.train[0])
-    return make_parts(robot, model.modifiers, model.written, model.study.numerics)
+    return make_parts(robot, model.terms, model.written, model.study.numerics)
 
 
 def _draft_in(source: Source, model: Identified, robot: Robot, target: Target) -> Draft:
@@ -173,22 +173,22 @@ def _is_mjcf(path: Path) -> bool:
 def _estimates_of(parts: Sequence[Part], model: Identified) -> list[tuple[Estimate, ...]]:
     slices: dict[int, tuple[Estimate, ...]] = {}
     column = 0
-    for modifier in model.modifiers:
-        size = len(modifier.parameters)
-        slices[id(modifier)] = model.estimates[column : column + size]
+    for term in model.terms:
+        size = len(term.parameters)
+        slices[id(term)] = model.estimates[column : column + size]
         column += size
-    return [slices.get(id(part.modifier), ()) for part in parts]
+    return [slices.get(id(part.term), ()) for part in parts]
 
 
 def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], str]:
     """Comments before what effects change or add; a declared parameter needs none where it has its own name."""
     notes: dict[tuple[Kind, str], str] = {}
     for part in target.parts:
-        if part.stand_in is None or (part.stand_in is part.modifier and not isinstance(part.modifier, Effect)):
+        if part.stand_in is None or (part.stand_in is part.term and not isinstance(part.term, Effect)):
             continue
         for change in changes:
             key: tuple[Kind, str] = (change.kind, change.name)  # type: ignore[assignment]
-            if part.modifier.name not in change.by or change.attribute in SOLVER or change.kind == "geom":
+            if part.term.name not in change.by or change.attribute in SOLVER or change.kind == "geom":
                 continue
             place = change.name.removesuffix("__link").removeprefix("payload_")
             words = describe(part, place)
@@ -277,8 +277,8 @@ def reported_losses(model: Identified) -> Losses:
     """Losses of the replays that a result reports."""
     study = model.study
     return Losses(
-        loss_of(study.train_problem(model.modifiers), model.values),
-        loss_of(study.holdout_problem(model.modifiers), model.values),
+        loss_of(study.train_problem(model.terms), model.values),
+        loss_of(study.holdout_problem(model.terms), model.values),
     )
 
 
@@ -302,21 +302,21 @@ def describe_model(outcome: Fit | Closing, result: dict[str, Any], folder: Folde
 
 def params_of(model: Identified) -> dict[str, Any]:
     """Content of ``params.json``: every parameter as it is written, with all that is known of it."""
-    held = {id(part.modifier): part.held for part in _parts(model)}
+    held = {id(part.term): part.held for part in _parts(model)}
     entries, column = [], 0
-    for modifier in model.modifiers:
-        size = len(modifier.parameters)
+    for term in model.terms:
+        size = len(term.parameters)
         rows = slice(column, column + size)
         known = model.estimates[rows] or (None,) * size
         column += size
         entries.append(
             {
-                "kind": "effect" if isinstance(modifier, Effect) else "parameter",
-                "name": modifier.name,
-                "variant": getattr(modifier, "variant", ""),
-                "where": modifier.places,
-                "shared": modifier.shared,
-                "in_file": held.get(id(modifier), "yes"),
+                "kind": "effect" if isinstance(term, Effect) else "parameter",
+                "name": term.name,
+                "variant": getattr(term, "variant", ""),
+                "where": term.places,
+                "shared": term.shared,
+                "in_file": held.get(id(term), "yes"),
                 "parameters": [
                     {
                         "name": p.name,
@@ -329,7 +329,7 @@ def params_of(model: Identified) -> dict[str, Any]:
                         "scale": p.scale,
                         "identifiable": None if e is None else e.identifiable,
                     }
-                    for p, value, e in zip(modifier.parameters, model.written[rows], known, strict=True)
+                    for p, value, e in zip(term.parameters, model.written[rows], known, strict=True)
                 ],
             }
         )
@@ -351,24 +351,24 @@ def file_losses(model: Identified, path: Path) -> tuple[Losses, bool]:
 def _missing(part: Part, model: Identified) -> dict[str, Any]:
     """What is not in the file, and the loss with it alone left out."""
     entry: dict[str, Any] = {
-        "name": part.modifier.name,
-        "variant": getattr(part.modifier, "variant", ""),
-        "where": list(part.modifier.places),
+        "name": part.term.name,
+        "variant": getattr(part.term, "variant", ""),
+        "where": list(part.term.places),
         "held": part.held,
         "how": part.how,
         "text": describe(part),
     }
-    if part.modifier not in model.modifiers:
+    if part.term not in model.terms:
         return {**entry, "loss_without": None}
     keep, column = [], 0
-    rest: list[Modifier] = []
-    for modifier in model.modifiers:
-        size = len(modifier.parameters)
-        if modifier is not part.modifier:
-            rest.append(modifier)
+    rest: list[Term] = []
+    for term in model.terms:
+        size = len(term.parameters)
+        if term is not part.term:
+            rest.append(term)
             keep += list(range(column, column + size))
         column += size
-    without = replace(model, modifiers=tuple(rest), values=model.values[keep])
+    without = replace(model, terms=tuple(rest), values=model.values[keep])
     return {**entry, "loss_without": asdict(reported_losses(without))}
 
 

@@ -1,5 +1,0 @@
-"""Replays on the workers of a dask cluster: `open_executor` gives what a study takes as its `executor`."""
-
-from sysid_btr.cluster.place import open_executor
-
-__all__ = ["open_executor"]

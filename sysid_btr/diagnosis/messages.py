@@ -1,0 +1,79 @@
+"""The finding in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sysid_btr.diagnosis.closing import NamedEffect, Verdict
+from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.scores import Scores
+from sysid_btr.terms.effect import Effect
+from sysid_btr.units import si_all
+
+
+def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
+    """One effect with places, amounts and intervals."""
+    kinds = len(effect.kinds)
+    parts = []
+    for i, group in enumerate(effect.groups):
+        own = found[i * kinds : (i + 1) * kinds]
+        amounts = ", ".join(_amount(e, k.name, kinds > 1) for e, k in zip(own, effect.kinds, strict=True))
+        parts.append(f"{_places(group.split(','))}: {amounts}")
+    return f"{effect.title}: " + "; ".join(parts)
+
+
+def _places(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) < 7 else f"{len(names)} places ({', '.join(names[:3])}, ...)"
+
+
+def _left(before: Scores, after: Scores, channel: str) -> str:
+    """How much of the error above the noise floor, squared, is left of the fitted and of the held-out part."""
+    parts = {"fitted": (before.train, after.train), "held-out": (before.holdout, after.holdout)}
+    shares = {
+        name: (new[channel].chi2 - 1) / max(old[channel].chi2 - 1, 1e-12)
+        for name, (old, new) in parts.items()
+        if channel in old and channel in new
+    }
+    percent = {name: 100 * max(share, 0.0) for name, share in shares.items()}
+    return " and ".join(f"{p:{'.0f' if p >= 1 else '.1g'}} % of the {name}" for name, p in percent.items()) + " error"
+
+
+def _amount(estimate: Estimate, kind: str, label: bool) -> str:
+    half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    text = f"{estimate.value:.3g} +- {half:.2g}{unit}"
+    return f"{kind} {text}" if label else text
+
+
+def message_of(
+    verdict: Verdict,
+    effects: Sequence[NamedEffect],
+    before: Scores,
+    after: Scores,
+    left: Mapping[str, Any] | None,
+    unit: str = "rad",
+) -> str:
+    """The verdict in one sentence, with the held-out error before and after; `effects` are the best there are."""
+    channel = "position"
+    errors = ""
+    if channel in before.holdout and channel in after.holdout:
+        old, new, floor = si_all(
+            [before.holdout[channel].rmse, after.holdout[channel].rmse, before.holdout[channel].floor], unit
+        )
+        errors = f" Held-out {channel} error {old} -> {new} (noise floor {floor})."
+    if verdict == "nothing_missing":
+        return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
+    if verdict == "unexplained":
+        hint = "" if not left else f" What is left is {left.get('summary', 'not characterised')}."
+        if effects:
+            listing = ", ".join(f"{e.effect} at {_places(e.where)}" for e in effects)
+            hint = f" The nearest, {listing}, leaves {_left(before, after, channel)} (squared): it is not named.{hint}"
+        return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
+    if left:
+        errors += f" Something is left that no effect accounts for: {left.get('summary', 'not characterised')}."
+    listing = "; ".join(e.sentence for e in effects)
+    if verdict == "ambiguous":
+        other = ", ".join(dict.fromkeys(c for e in effects for c in e.confused_with))
+        return f"Ambiguous: the model lacks {listing}; this log cannot tell it from {other}." + errors
+    return f"The model lacks {listing}." + errors

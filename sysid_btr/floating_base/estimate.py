@@ -1,0 +1,364 @@
+"""State of a floating base from a log: orientation from the IMU, height and velocity from the feet that stand.
+
+The base's velocity follows the accelerometer and is tied to the ground by feet that carry load: the point
+of such a foot that touches does not move, and lies at the floor's height (Bloesch et al. 2012,
+doi:10.15607/RSS.2012.VIII.003, as a fixed-interval smoother with the orientation found beforehand).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.errors import LogError, ModelError
+from sysid_btr.floating_base.events import Event, find_fall, find_pickups, find_slips, usable
+from sysid_btr.floating_base.feet import Foot, base_body, force_columns, points_in_base, touching_bodies
+from sysid_btr.floating_base.orientation import smooth_orientation, up_in_base
+from sysid_btr.floating_base.smoothing import Tracks, smooth, smooth_joints
+from sysid_btr.objectives.noise import noise_floor
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from sysid_btr.io.log import Log
+
+LOADED = 0.08
+"""Fraction of the weight on a foot above which it stands."""
+LOWEST = 0.015
+"""m above the lowest foot up to which a loaded foot can stand."""
+NEAR = 0.006
+"""m above the lowest foot up to which a foot stands where no force sensor says otherwise."""
+EDGE = 0.002
+"""m over which the points of a foot share its contact."""
+HEIGHT_STD = 0.0007
+"""m, of a standing foot's lowest point: the ground gives, soles are not flat."""
+SLIDE_STD = 0.005
+"""m/s, of the point of a standing foot that touches, beyond what encoders and gyro explain."""
+TILT_STD = 0.02
+"""rad, of the vertical taken from the accelerometer, at rest."""
+OUTLIER = 2.5
+"""Standard errors beyond which a foot's velocity is given less weight (Huber)."""
+ROUNDS = 3
+SUNK = 0.0005
+"""m, by which a loaded sole may lie lower than the floor: the same all the time, so no average removes it."""
+UNSTEADY = 1.6
+"""Factor on the standard deviations of velocities: motions jerk at impacts and rest between them, where the smoother
+takes them for alike. Calibrated on simulated walks."""
+GRAVITY = 9.81
+UNKNOWN = 5.0
+"""m/s2, of the base's acceleration where nothing measures it."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseState:
+    """Motion of the base and the joints, sample by sample, with standard deviations.
+
+    Attributes
+    ----------
+    time : (n,) s.
+    rotation : (n, 3, 3) base to world; yaw starts at zero.
+    position, velocity : (n, 3) of the base's origin in the world, m and m/s; x and y start at zero.
+    rate : (n, 3) angular velocity in the base's frame, rad/s.
+    joints : (j,) names.
+    joint_position, joint_velocity : (n, j).
+    rotation_std : (n, 3) about the world's axes, rad; the other `_std` are in the unit of what they belong to.
+    feet : (f,) bodies that touch the ground.
+    contact : (n, f) whether a foot stands.
+    events : falls, pick-ups, slips.
+    usable : (n,) samples outside of events.
+    lost : what could not be found out for want of a sensor, in words.
+    """
+
+    time: FloatArray
+    rotation: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    rate: FloatArray
+    joints: tuple[str, ...]
+    joint_position: FloatArray
+    joint_velocity: FloatArray
+    rotation_std: FloatArray
+    position_std: FloatArray
+    velocity_std: FloatArray
+    rate_std: FloatArray
+    joint_position_std: FloatArray
+    joint_velocity_std: FloatArray
+    feet: tuple[str, ...]
+    contact: BoolArray
+    events: tuple[Event, ...]
+    usable: BoolArray
+    lost: tuple[str, ...]
+
+    @property
+    def tilt(self) -> FloatArray:
+        """(n,) angle between the base's and the world's vertical, rad."""
+        return np.arccos(np.clip(self.rotation[:, 2, 2], -1.0, 1.0))
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """(n, 4) orientation as MuJoCo has it, scalar first."""
+        from scipy.spatial.transform import Rotation
+
+        return np.asarray(Rotation.from_matrix(self.rotation).as_quat()[:, [3, 0, 1, 2]])
+
+    def rows(self, start: int, stop: int) -> BaseState:
+        """Samples `start` to `stop` (exclusive)."""
+        n = len(self.time)
+        cut: dict[str, Any] = {
+            name: value[start:stop]
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray) and len(value) == n
+        }
+        return replace(self, **cut)
+
+
+def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addresses: IntArray) -> BaseState:
+    """Reconstruct the state of the base in one episode of a log.
+
+    Parameters
+    ----------
+    model : with a free base.
+    log : joint positions, ``imu.gyro_x..z``, and ``imu.angle_x``, ``imu.angle_y`` or ``imu.acc_x..z``;
+        ``force.*`` under the feet if there are any.
+    joints, addresses : joints of the model and their addresses in qpos, (j,).
+
+    Raises
+    ------
+    LogError
+        If the log lacks what the orientation of the base needs.
+    ModelError
+        If the model has no free base, or nothing that could touch the ground.
+    """
+    lost: list[str] = []
+    time = log.time - log.time[0]
+    feet = _feet(model)
+    measured = np.stack(
+        [
+            log.channels[f"position.{j}"] if log.has("position", j) else np.full(len(time), model.qpos0[a])
+            for j, a in zip(joints, addresses, strict=True)
+        ],
+        axis=1,
+    )
+    tracks = smooth_joints(time, measured)
+    gyro = imu_columns(log, ("gyro_x", "gyro_y", "gyro_z"))
+    rates = smooth_joints(time, gyro)
+    up, up_std = vertical(log, gyro, lost)
+    gyro_std = float(np.mean([noise_floor(c).sigma for c in gyro.T]))
+    rotation, rotation_std = smooth_orientation(time, gyro, up, gyro_std, up_std)
+    tilt = np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0))
+
+    here = points_in_base(model, feet, addresses, tracks.position)
+    ahead = points_in_base(model, feet, addresses, tracks.position + 1e-4 * tracks.velocity)
+    lowest, moving, spread = [], [], []
+    for foot, points, later in zip(feet, here, ahead, strict=True):
+        world = np.einsum("nij,nkj->nki", rotation, points)
+        height = world[..., 2] - foot.radius
+        share = np.exp(-(height - height.min(axis=1, keepdims=True)) / EDGE)
+        share /= share.sum(axis=1, keepdims=True)
+        relative = (later - points) / 1e-4 + np.cross(rates.position[:, None], points)
+        motion = np.einsum("nij,nkj->nki", rotation, relative)
+        lowest.append(np.sum(share * height, axis=1))
+        moving.append(np.einsum("nk,nki->ni", share, motion))
+        arm = np.linalg.norm(np.einsum("nk,nki->ni", share, world), axis=1)
+        noise = np.mean(tracks.velocity_std, axis=1) * 2 + np.mean(rates.position_std, axis=1)
+        spread.append(np.hypot(SLIDE_STD, arm * noise))
+    bottom = np.stack(lowest, axis=1)
+    load = foot_loads(model, feet, log, lost)
+    contact = find_contacts(bottom, load)
+    force = _specific_force(model, log, rates, lost)
+    position, velocity = _follow(
+        time, rotation, force, contact, bottom, np.stack(moving, axis=1), np.stack(spread, axis=1)
+    )
+    speed = np.linalg.norm(velocity[0][:, None] + np.stack(moving, axis=1), axis=2)
+    events: list[Event] = []
+    fall = find_fall(log.time, tilt)
+    if load is not None:
+        events += find_pickups(log.time, load.sum(axis=1))
+        slip_std = np.hypot(np.stack(spread, axis=1), velocity[1].mean(axis=1)[:, None])
+        events += find_slips(log.time, speed, slip_std, contact)
+    if fall is not None:
+        events = [*(e for e in events if e.start < fall.start), fall]
+    found = tuple(sorted(events, key=lambda e: e.start))
+    return BaseState(
+        time=log.time,
+        rotation=rotation,
+        position=position[0],
+        velocity=velocity[0],
+        rate=rates.position,
+        joints=tuple(joints),
+        joint_position=tracks.position,
+        joint_velocity=tracks.velocity,
+        rotation_std=rotation_std,
+        position_std=np.hypot(position[1], [0.0, 0.0, SUNK]),
+        velocity_std=UNSTEADY * velocity[1],
+        rate_std=UNSTEADY * rates.position_std,
+        joint_position_std=tracks.position_std,
+        joint_velocity_std=UNSTEADY * tracks.velocity_std,
+        feet=tuple(f.name for f in feet),
+        contact=contact,
+        events=found,
+        usable=usable(log.time, found),
+        lost=tuple(lost),
+    )
+
+
+def find_contacts(bottom: FloatArray, load: FloatArray | None) -> BoolArray:
+    """Which feet stand, (n, f).
+
+    Parameters
+    ----------
+    bottom : (n, f) height of each foot's lowest point below the base, m (negative down).
+    load : (n, f) force on each foot, any unit, or None.
+    """
+    above = bottom - bottom.min(axis=1, keepdims=True)
+    if load is None:
+        return np.asarray(above < NEAR)
+    weight = float(np.median(load.sum(axis=1)))
+    # single samples of a force sensor drop out while the foot stands
+    padded = np.pad(load, ((1, 1), (0, 0)), mode="edge")
+    held = np.maximum(padded[1:-1], np.minimum(padded[:-2], padded[2:]))
+    return np.asarray((held > LOADED * weight) & (above < LOWEST))
+
+
+def lowest_points(model: mujoco.MjModel, feet: Sequence[Foot], base: BaseState) -> FloatArray:
+    """(n, f) height of each foot's lowest point above the base's origin, m (negative down)."""
+    addresses = np.array([model.jnt_qposadr[model.joint(j).id] for j in base.joints], dtype=np.int64)
+    low = [
+        (np.einsum("nj,nkj->nk", base.rotation[:, 2], points) - foot.radius).min(axis=1)
+        for foot, points in zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True)
+    ]
+    return np.stack(low, axis=1)
+
+
+def _feet(model: mujoco.MjModel) -> tuple[Foot, ...]:
+    if base_body(model) < 0:
+        raise ModelError("the log says that its base was free, and the model has no free joint: give the free model")
+    feet = touching_bodies(model)
+    if not feet:
+        raise ModelError(
+            "the log says that its base was free, and nothing of the model can touch the ground: give the model a "
+            "floor, and contacts (contype, conaffinity) between it and the feet"
+        )
+    return feet
+
+
+def imu_columns(log: Log, names: tuple[str, ...]) -> FloatArray:
+    """Columns of the inertial unit, (n, k), with single missing values interpolated.
+
+    Raises
+    ------
+    LogError
+        If one of them is missing or empty.
+    """
+    missing = [f"imu.{n}" for n in names if not log.has("imu", n)]
+    if missing:
+        raise LogError(
+            f"log {log.path or ''}: its base was free, and {', '.join(missing)} is missing: the orientation of the "
+            "base needs imu.gyro_x..z, and imu.angle_x, imu.angle_y or imu.acc_x..z"
+        )
+    values = log.array("imu", names)
+    index = np.arange(len(values))
+    for column in values.T:
+        good = np.isfinite(column)
+        if not good.any():
+            raise LogError(f"log {log.path or ''}: a column of the IMU has no value")
+        column[~good] = np.interp(index[~good], index[good], column[good])
+    return values
+
+
+def vertical(log: Log, gyro: FloatArray, lost: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Measured vertical in the base's frame, and its standard deviation."""
+    if log.has("imu", "angle_x") and log.has("imu", "angle_y"):
+        angles = imu_columns(log, ("angle_x", "angle_y"))
+        sigma = float(np.mean([noise_floor(c).sigma for c in np.unwrap(angles, axis=0).T]))
+        return up_in_base(angles[:, 0], angles[:, 1]), np.full(len(angles), max(sigma, 1e-4))
+    force = imu_columns(log, ("acc_x", "acc_y", "acc_z"))
+    size = np.linalg.norm(force, axis=1)
+    lost.append("no inclinometer: the vertical is the accelerometer's, less sure while the robot accelerates")
+    return force / size[:, None], TILT_STD + np.abs(size - GRAVITY) / GRAVITY + 0.05
+
+
+def foot_loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list[str]) -> FloatArray | None:
+    """Force on each foot, (n, f); None, and what that means in `lost`, where nothing measures it."""
+    columns = force_columns(model, feet, log.joints("force"))
+    if not any(columns):
+        lost.append(
+            "no force sensors under the feet: a foot stands where it is the lowest; pick-ups and slips are not found, "
+            "and moments at which both feet are near the ground are less sure"
+        )
+        return None
+    return np.stack(
+        [np.nan_to_num(log.array("force", c)).sum(axis=1) if c else np.zeros(len(log)) for c in columns], axis=1
+    )
+
+
+def _specific_force(model: mujoco.MjModel, log: Log, rates: Tracks, lost: list[str]) -> tuple[FloatArray, float] | None:
+    """Specific force at the base's origin in its frame, (n, 3), and its noise; None without accelerometer."""
+    names = ("acc_x", "acc_y", "acc_z")
+    if not all(log.has("imu", a) for a in names):
+        lost.append("no accelerometer: the velocity between two stances is interpolated")
+        return None
+    force = imu_columns(log, names)
+    noise = float(np.mean([noise_floor(c).sigma for c in force.T]))
+    base = base_body(model)
+    for s in range(model.nsite):
+        if model.site(s).name == "imu" and model.site_bodyid[s] == base:
+            # the unit sits beside the origin, and feels the turning of the base there
+            arm = model.site_pos[s]
+            turning = np.cross(rates.velocity, arm) + np.cross(rates.position, np.cross(rates.position, arm))
+            noise = float(np.hypot(noise, np.linalg.norm(arm) * np.median(rates.velocity_std)))
+            return force - turning, noise
+    return force, noise
+
+
+def _follow(
+    time: FloatArray,
+    rotation: FloatArray,
+    force: tuple[FloatArray, float] | None,
+    contact: BoolArray,
+    bottom: FloatArray,
+    moving: FloatArray,
+    spread: FloatArray,
+) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Position and velocity of the base, each with its standard deviation, (n, 3)."""
+    n, feet = bottom.shape
+    step = np.diff(time)
+    if force is None:
+        push, doubt = np.zeros((n - 1, 3)), np.full((n - 1, 3), UNKNOWN)
+    else:
+        world = np.einsum("nij,nj->ni", rotation, force[0]) - [0.0, 0.0, GRAVITY]
+        doubt = np.hypot(force[1], 0.5 * np.abs(np.diff(world, axis=0)))
+        push = 0.5 * (world[1:] + world[:-1])
+    transition = np.tile(np.eye(2), (n - 1, 1, 1))
+    transition[:, 0, 1] = step
+    drive = np.stack([0.5 * push * step[:, None] ** 2, push * step[:, None]], axis=2)
+    reach = np.stack([0.5 * step**2, step], axis=1)
+    process = doubt[:, :, None, None] ** 2 * (reach[:, None, :, None] * reach[:, None, None, :])
+    process = process + 1e-12 * np.eye(2)
+    # measurements: for each foot the height of the base, and its velocity
+    rows = np.array([[1.0, 0.0]] * feet + [[0.0, 1.0]] * feet)
+    measured = np.empty((n, 3, 2 * feet))
+    variance = np.full((n, 3, 2 * feet), np.inf)
+    for f in range(feet):
+        measured[:, :, f] = 0.0
+        measured[:, 2, f] = -bottom[:, f]
+        variance[:, 2, f] = np.where(contact[:, f], HEIGHT_STD**2, np.inf)
+        measured[:, :, feet + f] = -moving[:, f]
+        variance[:, :, feet + f] = np.where(contact[:, f], spread[:, f] ** 2, np.inf)[:, None]
+    start = np.zeros((3, 2))
+    start[2, 0] = -bottom[0].min()
+    wide = np.tile(np.diag([0.05**2, 1.0]), (3, 1, 1))
+    wide[:2, 0, 0] = 1e-10
+    weighted = variance.copy()
+    for _ in range(ROUNDS):
+        found = smooth(transition, process, drive, rows, measured, weighted, (start, wide))
+        predicted = found.mean @ rows.T
+        with np.errstate(invalid="ignore"):
+            beyond = np.abs(measured - predicted) / np.sqrt(variance)
+        weighted = variance * np.maximum(np.nan_to_num(beyond) / OUTLIER, 1.0) ** 2
+    deviation = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=2, axis2=3), 0.0))
+    return (found.mean[..., 0], deviation[..., 0]), (found.mean[..., 1], deviation[..., 1])

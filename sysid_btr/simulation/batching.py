@@ -1,0 +1,147 @@
+"""Several logs under the same candidates in one batch: candidates times logs are its simulations.
+
+The cost of a step in Python, which laws need, is then shared among the logs; and a few candidates of many short logs
+fill all threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.simulation.engine import CHUNK, CHUNK_DOFS, Replay, set_out, write_model
+from sysid_btr.simulation.grid import Grid
+from sysid_btr.simulation.silence import quiet
+from sysid_btr.terms.base import Outputs, Rig
+
+if TYPE_CHECKING:
+    import mujoco
+
+ALIKE = 0.6
+"""Length of a log, as a fraction of the longest, from which it is worth simulating to the longest one's end."""
+
+
+def parties(replays: Sequence[Replay]) -> list[tuple[int, ...]]:
+    """Positions of the replays that can be simulated together, longest first in each party."""
+    order = sorted(range(len(replays)), key=lambda i: -replays[i].grid.steps)
+    found: list[list[int]] = []
+    for i in order:
+        for party in found:
+            first = replays[party[0]]
+            if replays[i].grid.steps >= ALIKE * first.grid.steps and _joinable(first, replays[i]):
+                party.append(i)
+                break
+        else:
+            found.append([i])
+    return sorted(tuple(party) for party in found)
+
+
+def chunks_together(
+    replays: Sequence[Replay], candidates: FloatArray
+) -> Iterator[tuple[slice, tuple[Outputs, ...]]]:
+    """Predicted sensors of all replays of a party, a chunk of candidates at a time.
+
+    Parameters
+    ----------
+    replays : that `parties` says can be simulated together.
+    candidates : (m, parameters).
+
+    Yields
+    ------
+    (slice, tuple of Outputs)
+        Rows of the chunk, and the sensors of every replay in turn; a diverged candidate is all NaN.
+    """
+    if len(replays) == 1:
+        for rows, alone in replays[0].chunks(candidates):
+            yield rows, (alone,)
+        return
+    candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
+    size = max(max(CHUNK, CHUNK_DOFS // max(replays[0].model.nv, 1)) // len(replays), 1)
+    for first in range(0, len(candidates), size):
+        rows = slice(first, min(first + size, len(candidates)))
+        with quiet():
+            outputs = _run(replays, candidates[rows])
+        yield rows, outputs
+
+
+def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ...]:
+    from mujoco.batch import Batch
+
+    lead, m = replays[0], len(candidates)
+    logs = len(replays)
+    batch = Batch(lead.model, m * logs, lead.threads)
+    rig = Rig(lead.model, batch, lead.index, lead.numerics.timestep)
+    shares = [slice(i * m, (i + 1) * m) for i in range(logs)]
+    for name in sorted({n for r in replays[1:] for n in _different(lead.model, r.model) or ()}):
+        array = rig.array(name)
+        for share, replay in zip(shares, replays, strict=True):
+            array[share] = getattr(replay.model, name)
+    values_of = lead._values(candidates)
+    pairs = [(term, np.tile(values, (logs, 1, 1))) for term, values in values_of]
+    write_model(rig, pairs)
+    grids = [replay.grid for replay in replays]
+    steps = max(grid.steps for grid in grids)
+    qpos = np.repeat(np.stack([r.start[0] for r in replays]), m, axis=0)
+    qvel = np.repeat(np.stack([r.start[1] for r in replays]), m, axis=0)
+    last = np.minimum(np.arange(steps), np.array([[g.steps - 1] for g in grids]))
+    command = np.repeat(np.stack([g.command[k] for g, k in zip(grids, last, strict=True)]), m, axis=0)
+    command, applied = set_out(rig, pairs, qpos, qvel, command, steps)
+    # borders that any of the logs wants to see
+    state = np.unique(np.concatenate([grid.state for grid in grids]))
+    whole = Grid(rig.timestep, np.empty((steps, 0)), grids[0].sample_time, state, state, state, np.zeros(0))
+    states = lead.integrate(
+        rig, pairs, command, applied, whole, [(r.log, g) for r, g in zip(replays, grids, strict=True)]
+    )
+    result = []
+    for share, replay, grid in zip(shares, replays, grids, strict=True):
+        own = states.of(share, np.searchsorted(state, grid.state))
+        own.repeat_last_effort()
+        result.append(replay.read(rig, share, values_of, own, command[share, : grid.steps], grid))
+    return tuple(result)
+
+
+def _joinable(a: Replay, b: Replay) -> bool:
+    """Whether two replays differ only in their logs and in numbers of their models."""
+    if type(a) is not Replay or type(b) is not Replay:
+        return False
+    same = (
+        a.terms == b.terms
+        and a.robot.always == b.robot.always
+        and a.numerics == b.numerics
+        and a.effort == b.effort
+        and a.threads == b.threads
+        and a.log.meta.mount == b.log.meta.mount
+        and _input_names(a) == _input_names(b)
+    )
+    return same and _different(a.model, b.model) is not None
+
+
+def _input_names(replay: Replay) -> frozenset[str]:
+    return frozenset(n for n in replay.log.channels if n.split(".")[0] in ("voltage", "enabled"))
+
+
+def _different(a: mujoco.MjModel, b: mujoco.MjModel) -> frozenset[str] | None:
+    """Fields in which two models differ; None if they differ in what one batch cannot hold."""
+    from mujoco.batch import MODEL_FIELDS
+
+    if not np.array_equal(_values(a.opt), _values(b.opt)) or a.names != b.names:
+        return None
+    found = set()
+    for name in (n for n in dir(a) if not n.startswith("_")):
+        x, y = getattr(a, name), getattr(b, name)
+        if isinstance(x, int) and name.startswith("n") and x != y:
+            return None
+        if isinstance(x, np.ndarray) and not np.array_equal(x, y, equal_nan=x.dtype.kind == "f"):
+            if name not in MODEL_FIELDS:
+                return None
+            found.add(name)
+    return frozenset(found)
+
+
+def _values(options: mujoco.MjOption) -> FloatArray:
+    """All numbers of MuJoCo's options."""
+    names = (n for n in dir(options) if not n.startswith("_"))
+    return np.concatenate([np.atleast_1d(np.asarray(getattr(options, n), dtype=np.float64)) for n in names])

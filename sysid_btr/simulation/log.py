@@ -1,0 +1,106 @@
+"""A replay as a log: what the sensors would have shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr.errors import UsageError
+from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import choose_numerics
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.grammar import parse_parameters
+
+if TYPE_CHECKING:
+    from sysid_btr._typing import FloatArray
+    from sysid_btr.io.log import Log
+    from sysid_btr.models.robot import Robot
+
+
+def replay_log(
+    robot: Robot,
+    log: Log,
+    parameters: Mapping[str, float] | tuple[tuple[Term, ...], FloatArray] | None = None,
+    *,
+    numerics: Numerics | None = None,
+    threads: int = 0,
+) -> Log:
+    """Give the log's commands to the model, and record its sensors at the log's own times.
+
+    Parameters
+    ----------
+    robot : the model.
+    log : commands, times and initial state; each episode starts anew.
+    parameters : expression of the grammar -> value, for example ``{"mass:*Knee*": 1.1, "kp:*": 0.9}``; or
+        terms with their values.
+    numerics : integrator and step; None chooses by a convergence check on the log.
+    threads : worker threads, 0 for all cores.
+
+    Returns
+    -------
+    Log
+        The same commands; position, velocity and effort (SI) of every joint of the model as predicted, NaN
+        where the replay diverged.
+
+    Raises
+    ------
+    UsageError
+        A parameter that the model does not have, or a value that is not finite.
+    """
+    from sysid_btr.identify.study import split_episodes
+
+    terms, values = (
+        parameters if isinstance(parameters, tuple) else set_parameters(robot, parameters or {})
+    )
+    episodes = split_episodes(log)
+    chosen = choose_numerics(robot.for_log(log), episodes[0], threads)[0] if numerics is None else numerics
+    parts: dict[str, list[FloatArray]] = {}
+    for episode in episodes:
+        run = Replay(robot.for_log(episode), episode, terms, chosen, effort=True, threads=threads)
+        outputs = run.predict(values[None])
+        for i, joint in enumerate(run.index.joints):
+            parts.setdefault(f"position.{joint}", []).append(outputs.position[0, :, i])
+            parts.setdefault(f"velocity.{joint}", []).append(outputs.velocity[0, :, i])
+            if outputs.effort is not None:
+                parts.setdefault(f"effort.{joint}", []).append(outputs.effort[0, :, i])
+    commands = {name: column for name, column in log.channels.items() if name.startswith("command.")}
+    rows = [i for s in log.episodes() if s.stop - s.start > 1 for i in range(s.start, s.stop)]
+    return replace(
+        log,
+        time=log.time[rows],
+        channels={
+            **{name: column[rows] for name, column in commands.items()},
+            **{name: np.concatenate(columns) for name, columns in parts.items()},
+        },
+        episode=log.episode[rows],
+        meta=replace(log.meta, source=f"replayed: {robot.name}, {chosen}", units={}),
+        path=None,
+        unknown={},
+    )
+
+
+def set_parameters(robot: Robot, parameters: Mapping[str, float]) -> tuple[tuple[Term, ...], FloatArray]:
+    """Terms that hold parameters at given values, and these values in order, (p,).
+
+    Raises
+    ------
+    UsageError
+        Naming every expression that matches nothing, and every value that is not finite.
+    """
+    wrong = [f"{name}={value}" for name, value in parameters.items() if not np.isfinite(value)]
+    if wrong:
+        raise UsageError(f"values must be finite numbers, not {', '.join(wrong)}")
+    terms: list[Term] = []
+    values: list[float] = []
+    for term, value in _declared(robot, parameters):
+        terms.append(term)
+        values += [value] * len(term.parameters)
+    return tuple(terms), np.array(values, dtype=np.float64)
+
+
+def _declared(robot: Robot, parameters: Mapping[str, float]) -> list[tuple[Term, float]]:
+    parse_parameters(list(parameters), robot)  # all problems at once, places freed twice among them
+    return [(m, value) for name, value in parameters.items() for m in parse_parameters([name], robot)]

@@ -1,0 +1,101 @@
+"""Choosing the integrator and the step by a convergence check on the log at hand."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.errors import ModelError
+from sysid_btr.models.robot import Robot
+from sysid_btr.objectives.noise import noise_floor
+from sysid_btr.simulation.engine import Numerics, Replay
+
+if TYPE_CHECKING:
+    from sysid_btr.io.log import Log
+
+PAPER_TIMING = Numerics("Euler", 0.055 / 7)
+"""Timing of the Back-to-Reality paper: seven steps between references that come every 55 ms."""
+COARSEST = 0.010
+FINEST = 0.00025
+TOLERATED = 0.02
+"""Root-mean-square change under half the step, in noise floors, at which a step is fine enough.
+
+Small against the noise of one sample is not small against what thousands of samples average to, so this
+is followed by a check of the fitted parameters themselves (`identify.check_numerics`).
+"""
+CHECK_SECONDS = 12.0
+
+
+def choose_numerics(robot: Robot, log: Log, threads: int = 0) -> tuple[Numerics, float]:
+    """Integrator and step for a log, and the change in noise floors when the step is halved.
+
+    A log that states its servo's period is replayed by one explicit Euler step a period, which is how a servo
+    behaves that reads its velocity from differences of position; `held_numerics` is the alternative.
+    Otherwise fourth-order Runge-Kutta, at the largest step that divides the sample period and passes the
+    check.
+
+    Raises
+    ------
+    ModelError
+        If the plain model diverges at every step.
+    """
+    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
+    if log.meta.servo_period:
+        return Numerics("Euler", float(log.meta.servo_period)), float("nan")
+    sample = float(np.median(np.diff(log.time)))
+    step = _divisor(sample, COARSEST)
+    now = _positions(robot, part, Numerics("RK4", step), threads)
+    while True:
+        half = _positions(robot, part, Numerics("RK4", step / 2), threads)
+        error = _change(part, now, half)
+        if error <= TOLERATED or (step / 2 < FINEST and np.isfinite(error)):
+            return Numerics("RK4", step), error
+        if step / 2 < FINEST:
+            raise ModelError(
+                f"model {robot.name}: the replay of {log.path or 'the log'} diverges even with a step of "
+                f"{1e3 * step:g} ms. Check gains, armature and masses of the model: a servo far too stiff "
+                "for its inertia, or a body without mass, is the usual cause."
+            )
+        step, now = step / 2, half
+
+
+def held_numerics(robot: Robot, log: Log, threads: int = 0) -> Numerics | None:
+    """Runge-Kutta steps under a servo torque that is held for the log's servo period.
+
+    Exact for a servo that knows its velocity. None where the log states no period, or where an explicit
+    Euler step a period, which is cheaper, does the same.
+    """
+    if not log.meta.servo_period:
+        return None
+    period = float(log.meta.servo_period)
+    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
+    held = Numerics("RK4", period, period)
+    now = _positions(robot, part, held, threads)
+    if _change(part, _positions(robot, part, Numerics("Euler", period), threads), now) <= TOLERATED:
+        return None
+    while True:
+        half = _positions(robot, part, held.halved(), threads)
+        if _change(part, now, half) <= TOLERATED or held.timestep / 2 < FINEST:
+            return held
+        held, now = held.halved(), half
+
+
+def _divisor(sample: float, most: float) -> float:
+    """Largest step, at most `most`, that divides the sample period."""
+    return sample / max(int(np.ceil(sample / most - 1e-9)), 1)
+
+
+def _positions(robot: Robot, log: Log, numerics: Numerics, threads: int) -> dict[str, FloatArray]:
+    replay = Replay(robot.for_log(log), log, (), numerics, threads=threads)
+    outputs = replay.predict(np.zeros((1, 0)))
+    return {j: outputs.position[0, :, i] for i, j in enumerate(replay.index.joints) if log.has("position", j)}
+
+
+def _change(log: Log, coarse: dict[str, FloatArray], fine: dict[str, FloatArray]) -> float:
+    worst = []
+    for joint, values in fine.items():
+        sigma = noise_floor(log.channels[f"position.{joint}"]).sigma
+        worst.append(np.sqrt(np.mean((values - coarse[joint]) ** 2)) / sigma)
+    return float(np.max(worst)) if worst else 0.0

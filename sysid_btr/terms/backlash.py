@@ -1,0 +1,121 @@
+"""Backlash: the link moves freely between two stops; sensor on the link, servo on the motor.
+
+Teeth in contact give way like a spring: a dead zone with a stiffness beyond it (Nordin and Gutman 2002,
+doi:10.1016/S0005-1098(02)00047-X). Taken for rigid, what they give way is taken for play.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.terms.base import LINK_SUFFIX, Kind, Rig
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
+
+HELD = 1e-7
+RIGID = 0.999
+"""Impedance of a stop that gives way no further."""
+GIVES = 1e-3
+"""Fraction of the joint's motion by which its torque presses into soft stops, at which a scan looks for play."""
+
+ROTOR_SHARE = 0.02
+"""Inertia of a rotor that the model says nothing of, as a fraction of the joint's."""
+
+
+@dataclass(frozen=True)
+class Backlash(Effect):
+    """Structure: a second joint on the link, between soft stops at +-play / 2; all damping of the joint on the link.
+
+    Friction between housing and link acts on the link, that of motor and gear on the motor; which one the
+    model's own damping describes, the log must tell, so the other case is the variant `motor`.
+    """
+
+    name: ClassVar[str] = "backlash"
+    title: ClassVar[str] = "play in the gear"
+    variant: ClassVar[str] = "link"
+    scope: ClassVar = "servo"
+    structural: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("play", "rad", 0.0, 0.0, 0.2, 0.004),
+        Kind("softness", "rad/Nm", 0.0, 0.0, 0.02, 0.0005),
+    )
+    held: ClassVar[tuple[str, ...]] = ("softness",)
+    details: ClassVar[tuple[str, ...]] = held
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("joint_compliance", "loads of several sizes"),
+        ("coulomb_friction", "reversals under a load that does not change sign"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        soft = GIVES * max(scale.span, 1e-9) / max(scale.torque_rms, 1e-9)
+        return (cls.kinds[0], Kind("softness", scale.unit("rad/Nm"), 0.0, 0.0, 20 * soft, soft))
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        soft = cls.sized(scale)[1].scale
+        return (((0.008, soft),), ((0.03, soft),))
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        for name in self.places:
+            add_link_joint(spec, name, damping_on_link=self.variant == "link")
+            link = spec.joint(name + LINK_SUFFIX)
+            link.limited = True
+            link.range = [-HELD, HELD]
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        """Stops as MuJoCo's soft limits: of stiffness k / R, where R = (1 - d) / d times the joint's mobility.
+
+        k is the largest that the integrator bears, and the impedance d follows. What the limit adds to the inertia
+        vanishes with the square of the step.
+        """
+        import mujoco
+
+        ids = np.array([rig.model.joint(name + LINK_SUFFIX).id for name in self.places])
+        half = np.maximum(values[:, :, 0] / 2, HELD)
+        ranges = rig.array("jnt_range")
+        ranges[:, ids, 0], ranges[:, ids, 1] = -half, half
+        mobility = rig.model.dof_invweight0[rig.model.jnt_dofadr[ids]]
+        steps = 1.0 if rig.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 2.0
+        rate = 1 / (steps * rig.timestep) ** 2
+        impedance = np.minimum(1 / (1 + rate * values[:, :, 1] / mobility), RIGID)
+        solref, solimp = rig.array("jnt_solref"), rig.array("jnt_solimp")
+        solref[:, ids, 0], solref[:, ids, 1] = -rate * impedance, -2 * np.sqrt(rate * impedance)
+        solimp[:, ids, 0], solimp[:, ids, 1] = impedance, impedance
+
+
+@dataclass(frozen=True)
+class BacklashMotor(Backlash):
+    """The joint's own damping stays on the motor."""
+
+    variant: ClassVar[str] = "motor"
+
+
+def add_link_joint(spec: mujoco.MjSpec, name: str, *, damping_on_link: bool) -> None:
+    """Split a joint into a motor side (the joint itself) and a link side (a second one, same axis).
+
+    The rotor's inertia, friction and servo stay on the motor side; a rotor that the model gives no inertia gets a
+    trace of the joint's, because a side without any cannot be simulated.
+    """
+    joint = spec.joint(name)
+    if joint.armature == 0:
+        plain = spec.copy().compile()
+        joint.armature = ROTOR_SHARE * float(plain.dof_M0[plain.joint(name).dofadr[0]])
+    link = joint.parent.add_joint(name=name + LINK_SUFFIX, type=joint.type, axis=joint.axis, pos=joint.pos)
+    link.damping = [0.0, 0.0, 0.0]
+    link.armature = 0.0
+    if not damping_on_link:
+        return
+    damping = np.array(joint.damping)
+    joint.damping = [0.0, 0.0, 0.0]
+    tendon = spec.add_tendon(name=name + LINK_SUFFIX)
+    tendon.damping = damping
+    tendon.wrap_joint(name, 1.0)
+    tendon.wrap_joint(name + LINK_SUFFIX, 1.0)

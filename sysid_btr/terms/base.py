@@ -1,0 +1,259 @@
+"""Parametrised changes of a model: the one mechanism behind declared parameters and effects.
+
+A `Term` owns a few parameters at a few places (joints, bodies, or the whole robot) and takes part in
+a replay at the stages it needs, by overriding the hooks below. All hooks act on a batch of candidates at
+once; ``values`` always has the shape (candidates, places, kinds).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco.batch import Batch
+
+
+LINK_SUFFIX = "__link"
+"""Name ending of what play or compliance adds on the link side of a joint: a second joint, a tendon."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that a candidate carries.
+
+    Attributes
+    ----------
+    name : as in the parameter grammar, for example ``mass:RKneePitch``.
+    unit : SI unit, ``1`` for scale factors.
+    nominal : value at which the model is exactly the plain one.
+    lower, upper : bounds of the search.
+    scale : size of a change that matters (finite differences, starts, scans).
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    lower: float
+    upper: float
+    scale: float
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a modifier's parameter is, before it is tied to a place."""
+
+    name: str
+    unit: str
+    nominal: float
+    lower: float
+    upper: float
+    scale: float
+
+
+@dataclass(frozen=True)
+class Index:
+    """Where the log's joints live in the compiled model.
+
+    Attributes
+    ----------
+    joints : joint names in the order of the outputs, (nj,).
+    qpos, dof, actuator, body : their addresses, (nj,); actuator is -1 for a joint without a servo.
+    link_qpos, link_dof : addresses of a second, play or compliance joint on the link side, -1 where none.
+    base : addresses in qpos and qvel of a free base that is to be recorded, None where it is not.
+    """
+
+    joints: tuple[str, ...]
+    qpos: IntArray
+    dof: IntArray
+    actuator: IntArray
+    body: IntArray
+    link_qpos: IntArray
+    link_dof: IntArray
+    base: tuple[int, int] | None = None
+
+    def of(self, names: Sequence[str]) -> IntArray:
+        """Positions of joint names in the outputs."""
+        lookup = {name: i for i, name in enumerate(self.joints)}
+        return np.array([lookup[name] for name in names], dtype=np.int64)
+
+
+@dataclass
+class Rig:
+    """One batch of simulations being set up: the model, its expanded fields and its index."""
+
+    model: mujoco.MjModel
+    batch: Batch
+    index: Index
+    timestep: float
+    touched: set[str] = field(default_factory=set)
+
+    def array(self, name: str) -> Any:
+        """Live per-candidate values of a compiled model field, (candidates, ...)."""
+        self.touched.add(name)
+        return self.batch.expand(name)
+
+    @property
+    def size(self) -> int:
+        return int(self.batch.nsim)
+
+
+@dataclass
+class Step:
+    """What a law sees and adds to at one simulation step; arrays are (candidates, joints of the log).
+
+    `qpos` and `qvel` are the motor side, extrapolated to the middle of the step, which makes a law that is
+    held over the step second-order accurate. `torque` is the plain servo's torque there, `load` the torque by which
+    gravity and the motion of the links load the joint, as of the last step.
+    Laws add to `motor_torque`, `joint_torque`, `friction`; multiply `gain`; narrow `limit`.
+    """
+
+    time: float
+    timestep: float
+    command: FloatArray
+    qpos: FloatArray
+    qvel: FloatArray
+    torque: FloatArray
+    gain: FloatArray
+    motor_torque: FloatArray
+    joint_torque: FloatArray
+    friction: FloatArray
+    limit_low: FloatArray
+    limit_high: FloatArray
+    inputs: dict[str, FloatArray]
+    load: FloatArray
+
+    @property
+    def drive(self) -> FloatArray:
+        """The servo's torque under what other laws have done to it so far."""
+        total = self.gain * self.torque + self.motor_torque
+        return np.minimum(np.maximum(total, self.limit_low), self.limit_high)
+
+
+@dataclass
+class Outputs:
+    """Predicted sensors at the log's sample times; arrays are (candidates, samples, joints of the log).
+
+    `base`, where it is recorded, is (candidates, samples, 13): position, quaternion, velocity, angular velocity of
+    the free base as MuJoCo has them, at the step border before each sample.
+    """
+
+    time: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    effort: FloatArray | None
+    base: FloatArray | None = None
+
+
+Scope = Literal["body", "joint", "servo", "robot"]
+
+
+@dataclass(frozen=True)
+class Term:
+    """Base of everything that changes a model under parameters; hooks that do nothing by default.
+
+    Attributes
+    ----------
+    places : joint or body names, or ``("robot",)``.
+    shared : one set of parameters for all places instead of one each.
+    known : the parameters with the nominal values and bounds of a robot, once these are known.
+    """
+
+    places: tuple[str, ...]
+    shared: bool = False
+    known: tuple[Parameter, ...] = ()
+
+    name: ClassVar[str] = ""
+    label: ClassVar[str] = ""
+    """In the names of its parameters, where the name alone would not tell it from another one beside it."""
+    kinds: ClassVar[tuple[Kind, ...]] = ()
+    scope: ClassVar[Scope] = "joint"
+    """What its places are."""
+    structural: ClassVar[bool] = False
+    """Whether it adds joints to the model, which then has to be compiled for its places."""
+    law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
+    """What the law may change beside the joint torque: gain and motor torque, friction, limits."""
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Label of each independent set of parameters."""
+        return tuple(",".join(places) for places in self.grouped)
+
+    @property
+    def grouped(self) -> tuple[tuple[str, ...], ...]:
+        """Places of each independent set of parameters."""
+        if self.shared and len(self.places) > 1:
+            return (self.places,)
+        return tuple((place,) for place in self.places)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The free numbers, place by place, kind by kind within a place."""
+        if self.known:
+            return self.known
+        result = []
+        for group in self.groups:
+            for kind in self.kinds:
+                name = self.label or self.name
+                label = name if len(self.kinds) == 1 else f"{name}.{kind.name}"
+                result.append(
+                    Parameter(
+                        f"{label}:{group}",
+                        kind.unit,
+                        kind.nominal,
+                        kind.lower,
+                        kind.upper,
+                        kind.scale,
+                    )
+                )
+        return tuple(result)
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Candidate numbers (m, parameters) as (m, places, kinds)."""
+        shaped = values.reshape(len(values), len(self.groups), len(self.kinds))
+        return np.broadcast_to(shaped, (len(values), len(self.places), len(self.kinds)))
+
+    def spread_parameters(self, kind: int) -> tuple[Parameter, ...]:
+        """The parameter of one kind for each place."""
+        own = self.parameters[kind :: len(self.kinds)]
+        return own * len(self.places) if len(own) == 1 else own
+
+    # --- hooks, in the order in which a replay calls them -------------------------------------------------
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        """Add structure before the model is compiled (once, never per candidate)."""
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        """Write per-candidate model fields."""
+
+    def initial_state(self, rig: Rig, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        """Change the starting state in place; qpos and qvel are (m, joints of the log)."""
+
+    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
+        """Transform the commands that reach the servos, (m, steps, joints of the log)."""
+        return command
+
+    def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray | None:
+        """Joint torque known in advance, (m, steps, joints of the log), or None."""
+        return None
+
+    def start_law(self, rig: Rig, values: FloatArray) -> Any:
+        """Memory of the law at the start of a replay."""
+        return None
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        """Act at every step; `index` are the positions of the places among the joints of the log."""
+
+    def read_out(self, rig: Rig, values: FloatArray, outputs: Outputs) -> None:
+        """Change what the sensors show, in place."""
+
+    @classmethod
+    def overrides(cls, hook: str) -> bool:
+        """Whether this term takes part in a stage."""
+        return getattr(cls, hook) is not getattr(Term, hook)

@@ -1,0 +1,36 @@
+"""Softness of the contact between feet and ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.scales import JointScale
+
+
+@dataclass(frozen=True)
+class FootCompliance(Effect):
+    """Native: the time constant of `geom_solref` as a factor of the nominal."""
+
+    name: ClassVar[str] = "foot_compliance"
+    title: ClassVar[str] = "change of the ground's softness"
+    scope: ClassVar = "robot"
+    needs: ClassVar[str] = "a free base on the ground"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("factor", "1", 1.0, 0.2, 10.0, 0.2),)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("joint_compliance", "motion in the air"),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return (((1.5,),), ((3.0,),))
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        touching = (rig.model.geom_contype != 0) | (rig.model.geom_conaffinity != 0)
+        solref = rig.array("geom_solref")
+        standard = touching & (rig.model.geom_solref[:, 0] > 0)
+        solref[:, np.flatnonzero(standard), 0] *= values[:, 0, :1]

@@ -1,0 +1,71 @@
+"""Compliance between motor and link: a gear or shaft that twists; sensor on the link, servo on the motor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.terms.backlash import add_link_joint
+from sysid_btr.terms.base import LINK_SUFFIX, Kind, Rig
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
+
+RELAXATION = 0.004
+"""Ratio of the spring's damping to its stiffness, s: well damped, as gears are."""
+
+
+@dataclass(frozen=True)
+class JointCompliance(Effect):
+    """Structure: a second joint on the link with a stiff spring."""
+
+    name: ClassVar[str] = "joint_compliance"
+    title: ClassVar[str] = "softness of the gear"
+    variant: ClassVar[str] = "link"
+    scope: ClassVar = "servo"
+    structural: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("softness", "rad/Nm", 0.0, 0.0, 0.2, 0.005),)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("backlash", "loads of several sizes"),
+        ("kp", "a logged effort, or fast motion"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        size = 0.004 * max(scale.span, 1e-9) / max(scale.torque_rms, 1e-9)
+        return (Kind("softness", scale.unit("rad/Nm"), 0.0, 0.0, 100 * size, size),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        size = cls.sized(scale)[0].scale
+        return (((2 * size,),), ((8 * size,),))
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        for name in self.places:
+            add_link_joint(spec, name, damping_on_link=self.variant == "link")
+            spec.joint(name + LINK_SUFFIX).stiffness = [1.0, 0.0, 0.0]
+            spec.joint(name + LINK_SUFFIX).damping = [1.0, 0.0, 0.0]
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        ids = np.array([rig.model.joint(name + LINK_SUFFIX).id for name in self.places])
+        dofs = rig.model.jnt_dofadr[ids]
+        mobility = rig.model.dof_invweight0[dofs]
+        # the stiffest spring that stays stable, with a margin of 2 (Euler) or 4 (RK4) for other poses:
+        # (omega h)^2 = 2
+        stiffest = 2.0 / (mobility * rig.timestep**2)
+        stiffness = 1 / np.maximum(values[:, :, 0], 1 / stiffest)
+        rig.array("jnt_stiffness")[:, ids] = stiffness
+        most = 0.5 / (mobility * rig.timestep)
+        rig.array("dof_damping")[:, dofs] = np.minimum(RELAXATION * stiffness, most)
+
+
+@dataclass(frozen=True)
+class JointComplianceMotor(JointCompliance):
+    """The joint's own damping stays on the motor."""
+
+    variant: ClassVar[str] = "motor"

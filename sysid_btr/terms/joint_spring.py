@@ -1,0 +1,65 @@
+"""A spring across a joint: a cable, a rubber stop, gravity compensation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.scales import JointScale
+
+
+@dataclass(frozen=True)
+class JointSpring(Effect):
+    """Native: `jnt_stiffness` and `qpos_spring`; stiffness zero is the plain model at any rest angle."""
+
+    name: ClassVar[str] = "joint_spring"
+    title: ClassVar[str] = "spring across the joint"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("stiffness", "Nm/rad", 0.0, 0.0, 10.0, 0.1),
+        Kind("rest", "rad", 0.0, -3.0, 3.0, 0.1),
+    )
+    includes: ClassVar[tuple[str, ...]] = ("constant_force",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("payload", "the same joint angle in another orientation to gravity"),
+        ("encoder_scale", "a logged effort"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        k, reach = scale.torque_rms / scale.span, 3 * max(scale.span, 1.0)
+        return (
+            Kind("stiffness", scale.unit("Nm/rad"), 0.0, 0.0, 30 * k, 0.3 * k),
+            Kind("rest", scale.unit("rad"), 0.0, -reach, reach, 0.2 * scale.span),
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        k = cls.sized(scale)[0].scale
+        return (((k, 0.0), (k, scale.span)),)
+
+    @classmethod
+    def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
+        """The probe's directions are equal springs at several places: amounts add, places average."""
+        total = float(np.sum(amounts))
+        if total <= 0.05 * float(np.sum(np.abs(amounts))):
+            return None
+        kinds = cls.sized(scale)
+        values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
+        values[0] *= total
+        return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        ids = [rig.model.joint(name).id for name in self.places]
+        qpos = rig.model.jnt_qposadr[ids]
+        stiffness, rest = rig.array("jnt_stiffness"), rig.array("qpos_spring")
+        before = stiffness[:, ids].copy()
+        total = before + values[:, :, 0]
+        moment = before * rest[:, qpos] + values[:, :, 0] * values[:, :, 1]
+        rest[:, qpos] = np.where(total > 0, moment / np.where(total > 0, total, 1.0), rest[:, qpos])
+        stiffness[:, ids] = total

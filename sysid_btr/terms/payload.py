@@ -1,0 +1,119 @@
+"""A load that a body carries: a mass at a place in the body's frame, with an inertia of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.fields import allow_any_inertia
+from sysid_btr.terms.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+ARM = 0.05
+"""Distance, m, of a load whose mass a scan cannot tell from its place."""
+
+LEVERS = (0.03, 0.2)
+"""Distances, m, that a scan is believed."""
+
+
+@dataclass(frozen=True)
+class Payload(Effect):
+    """Native: the body's mass, centre of mass and inertia are those of body and load together.
+
+    The parameters are the mass and the position of the load in the frame of the body, whose origin is
+    the joint it hangs on where the model follows the usual convention, and the inertia about its own centre, alike
+    about all axes, as of a ball. A load taken for a point would pay for its size with its mass and place.
+    """
+
+    name: ClassVar[str] = "payload"
+    title: ClassVar[str] = "payload"
+    scope: ClassVar = "body"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("mass", "kg", 0.0, 0.0, 2.0, 0.05),
+        *(Kind(axis, "m", 0.0, -0.3, 0.3, 0.02) for axis in "xyz"),
+        Kind("inertia", "kg m^2", 0.0, 0.0, 0.01, 2e-5),
+    )
+    details: ClassVar[tuple[str, ...]] = ("inertia",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("mass", "nothing, where the load sits at the body's centre of mass"),
+        ("com_offset", "a free base, or fast motion"),
+        ("joint_spring", "the same joint angle in another orientation to gravity"),
+    )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        m, d = 0.05, 0.05
+        return (tuple((m, *place, 0.0) for place in ((0.0, 0.0, 0.0), (d, 0.0, 0.0), (0.0, d, 0.0), (0.0, 0.0, d))),)
+
+    @classmethod
+    def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
+        """The probe's directions are equal loads at several places: amounts add, places average."""
+        total = float(np.sum(amounts))
+        moment = np.dot(amounts, [[d[0] * x for x in d[1:4]] for d in probe])
+        size = float(np.linalg.norm(moment))
+        lever = size / (total * probe[0][0]) if total > 0 else 0.0
+        if not LEVERS[0] <= lever <= LEVERS[1]:
+            # the mass is hardly told: begin from one that has the moment at a hand's breadth
+            if size == 0:
+                return None
+            mass = min(size / ARM, cls.kinds[0].upper)
+            return np.array([mass, *(moment / mass), 0.0])
+        kinds = cls.sized(scale)
+        values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
+        values[0] *= total
+        return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        allow_any_inertia(spec, self.places)
+
+    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+        mass, inertia = rig.array("body_mass"), rig.array("body_inertia")
+        ipos, iquat = rig.array("body_ipos"), rig.array("body_iquat")
+        for place, name in enumerate(self.places):
+            body = rig.model.body(name).id
+            added, where, ball = values[:, place, 0], values[:, place, 1:4], values[:, place, 4]
+            loaded = added > 0
+            if not loaded.any():
+                continue
+            own, centre = mass[:, body].copy(), ipos[:, body].copy()
+            total = own + added
+            joint = (own[:, None] * centre + added[:, None] * where) / total[:, None]
+            rotation = _matrices(iquat[:, body])
+            tensor = np.einsum("mij,mj,mkj->mik", rotation, inertia[:, body], rotation)
+            tensor = tensor + _point(own, centre - joint) + _point(added, where - joint)
+            tensor = tensor + ball[:, None, None] * np.eye(3)
+            principal, axes = np.linalg.eigh(tensor)
+            axes[np.linalg.det(axes) < 0, :, 0] *= -1
+            mass[loaded, body] = total[loaded]
+            ipos[loaded, body] = joint[loaded]
+            inertia[loaded, body] = principal[loaded]
+            iquat[loaded, body] = _quaternions(axes[loaded])
+
+
+def _point(mass: FloatArray, r: FloatArray) -> FloatArray:
+    """Inertia (m, 3, 3) of point masses at r about the origin."""
+    square = np.einsum("mi,mi->m", r, r)
+    outer = np.einsum("mi,mj->mij", r, r)
+    result: FloatArray = mass[:, None, None] * (square[:, None, None] * np.eye(3) - outer)
+    return result
+
+
+def _matrices(quaternions: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())
+
+
+def _quaternions(matrices: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(matrices).as_quat(scalar_first=True))

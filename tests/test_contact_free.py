@@ -1,0 +1,193 @@
+"""Masses from walks where nothing is known of the ground."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from walks import record_walk
+
+from benchmarks import ground
+from sysid_btr.floating_base import contact_free
+from sysid_btr.floating_base.contact_free import difference, without_ground
+from sysid_btr.floating_base.fusion import weigh_walks
+from sysid_btr.identify.intervals import Known, estimates
+from sysid_btr.identify.study import Study, make_study
+from sysid_btr.io.log import Log
+from sysid_btr.models.gait import Gait
+from sysid_btr.models.robot import load_robot
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
+
+MASSES = ["mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"]
+
+
+def random_states(n: int, joints: int, rng: np.random.Generator) -> Windows:
+    quaternion = rng.normal(size=(n, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    rows = np.stack([np.arange(n), np.arange(n) + 2], axis=1)
+    three = (rng.normal(size=(n, 3)) for _ in range(3))
+    position, velocity, rate = three
+    q, dq = rng.normal(size=(2, n, joints))
+    return Windows(rows, position, quaternion, velocity, rate, q, dq, np.ones((n, BASE + 2 * joints)))
+
+
+def problem_of(study: Study, values: dict[str, float] | None = None) -> tuple[ReplayProblem, np.ndarray]:
+    terms = study.declare(MASSES)
+    problem = study.train_problem(terms)
+    begin = np.array([(values or {}).get(p.name, p.nominal) for p in problem.parameters])
+    return problem, begin
+
+
+def test_difference_undoes_a_move() -> None:
+    rng = np.random.default_rng(3)
+    states = random_states(7, 4, rng)
+    change = 0.3 * rng.normal(size=states.std.shape)
+    np.testing.assert_allclose(difference(states.moved(change), states), change, atol=1e-12)
+
+
+def test_knowledge_from_two_sources_is_weighed_by_its_precision() -> None:
+    known = Known(np.array([2]), np.array([1.0]), np.array([[0.04]]))
+    both = known.joined(np.array([2.0]), np.array([[0.01]]))
+    assert both.mean[0] == pytest.approx((1.0 / 0.04 + 2.0 / 0.01) / (1 / 0.04 + 1 / 0.01))
+    assert both.covariance[0, 0] == pytest.approx(1 / (1 / 0.04 + 1 / 0.01))
+    far = known.joined(np.array([5.0]), np.array([[1e9]]))
+    assert far.mean[0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_what_is_held_moves_what_is_known_of_the_others() -> None:
+    covariance = np.array([[0.04, -0.03, 0.0], [-0.03, 0.09, 0.01], [0.0, 0.01, 0.02]])
+    known = Known(np.array([1, 4, 5]), np.array([1.0, 2.0, 3.0]), covariance)
+    values = np.array([9.0, 1.0, 9.0, 9.0, 2.5, 3.0])
+    beside = known.beside(np.array([0, 4]), values)
+    np.testing.assert_allclose(beside, [1.0 - 0.03 / 0.09 * 0.5, 2.5, 3.0 + 0.01 / 0.09 * 0.5])
+    np.testing.assert_allclose(known.beside(np.array([0]), values), known.mean)
+    low = np.array([0.0, 0.0, 0.0, 0.0, 2.5, 0.0])
+    np.testing.assert_allclose(known.within(low, np.full(6, 9.0)), beside)
+
+
+def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
+    rng = np.random.default_rng(8)
+    n, joints, feet, p = 5, 3, 2, 4
+    states = random_states(n, joints, rng)
+    d, w = states.std.shape[1], n - 1
+    chain = contact_free._Chain(
+        steps=cast(Any, None),
+        states=states,
+        touch=np.ones((w, feet), dtype=bool),
+        linked=np.array([True, True, False, True]),
+        measured=rng.normal(size=(n, joints + 5)),
+        sigma=np.where(rng.random((n, joints + 5)) < 0.2, np.inf, 0.5),
+        time=np.arange(n) * 0.02,
+        weight=0.01,
+    )
+    shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3]
+    known = contact_free._Derivatives(*(0.1 * rng.normal(size=s) for s in shapes))
+    ends = contact_free._Ends(1e-3 * rng.normal(size=(w, d)), 1e-3 * rng.normal(size=(w, d, p)))
+    found = contact_free._linearise(chain, known, ends)
+
+    sizes, forces, _ = contact_free._unexplained(chain, known)
+    kinds = (contact_free.SLACK_POSITION,) * 2 + (contact_free.SLACK_VELOCITY,) * 2
+    kinds += (contact_free.SLACK_POSITION, contact_free.SLACK_VELOCITY)
+    slack, loose = contact_free._each(kinds, states), contact_free._each(contact_free.LOOSE, states)
+    sight, seen = contact_free._measurements(chain)
+    k = len(sizes)
+    unknown = n * d + w * k
+    rows, rests, numbers = [np.zeros((n * d, unknown))], [np.zeros(n * d)], [np.zeros((n * d, p))]
+    rows[0][:, : n * d] = np.diag(1 / np.tile(loose, n))
+    for i in range(n):
+        own = np.zeros((joints + 5, unknown))
+        own[:, i * d : (i + 1) * d] = sight[i]
+        rows.append(own)
+        rests.append(seen[i])
+        numbers.append(np.zeros((joints + 5, p)))
+    for i in np.flatnonzero(chain.linked):
+        own = np.zeros((d + k, unknown))
+        own[:d, i * d : (i + 1) * d] = known.start[i] / slack[:, None]
+        own[:d, (i + 1) * d : (i + 2) * d] = -np.diag(1 / slack)
+        at = n * d + i * k
+        own[:d, at : at + k] = forces[i] / slack[:, None]
+        own[d:, at : at + k] = np.eye(k)
+        rows.append(own)
+        rests.append(np.concatenate([ends.defect[i] / slack, np.zeros(k)]))
+        numbers.append(np.concatenate([ends.by_number[i] / slack[:, None], np.zeros((k, p))]))
+    matrix, rest, by = np.concatenate(rows), np.concatenate(rests), np.concatenate(numbers)
+    used = np.abs(matrix).sum(axis=0) > 0
+    basis = np.linalg.qr(matrix[:, used])[0]
+
+    def left(x: np.ndarray) -> np.ndarray:
+        return x - basis @ (basis.T @ x)
+
+    cost = float(found.left[:, 0] @ found.left[:, 0])
+    assert cost == pytest.approx(float(rest @ left(rest)), rel=1e-6)
+    np.testing.assert_allclose(found.information, by.T @ left(by), rtol=1e-5, atol=1e-8 * np.abs(by.T @ by).max())
+    np.testing.assert_allclose(found.gradient, by.T @ left(rest), rtol=1e-4, atol=1e-6 * np.abs(by.T @ rest).max())
+
+
+@pytest.fixture(scope="module")
+def on_springs() -> tuple[ground.Walker, Log]:
+    """A walk over springs and dampers, with masses far from the model's."""
+    walker = ground.draw(5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ground, "SECONDS", 7.0)
+        log = ground.record(walker)
+    assert log is not None
+    return walker, log
+
+
+def test_masses_come_out_whatever_the_ground_is(on_springs: tuple[ground.Walker, Log]) -> None:
+    walker, log = on_springs
+    study = make_study(load_robot("nao"), [log])
+    problem, begin = problem_of(study)
+    found = without_ground(problem, begin)
+    assert found is not None
+    truth = {f"mass:{name}": factor for name, factor in walker.masses.items()}
+    truth |= {"kp:*": walker.kp, "kv:*": walker.kv}
+    std = np.sqrt(np.diag(found.covariance))
+    error = np.array([m - truth[problem.parameters[i].name] for i, m in zip(found.which, found.mean, strict=True)])
+    assert np.all(np.abs(error) < 3 * std), dict(zip(problem.names, zip(error, std, strict=True), strict=True))
+    assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
+    by_name = dict(zip(problem.names, std, strict=True))
+    assert max(by_name[f"mass:{side}KneePitch"] for side in "RL") < 0.15
+    assert max(by_name[f"mass:{side}HipPitch"] for side in "RL") < 0.3
+
+    # what a fit with the model's ground tells gives way to it
+    rows = np.arange(60)
+    jacobian = np.zeros((problem.count, len(begin)))
+    jacobian[rows, rows % len(begin)] = 3.0
+    weighed = weigh_walks(study, problem, begin, jacobian, np.zeros(problem.count))
+    assert weighed.known is not None
+    told = estimates(
+        problem.parameters,
+        weighed.values,
+        weighed.jacobian,
+        weighed.residual,
+        problem.blocks,
+        weighed.error,
+        weighed.known,
+    )
+    for e, mean, own in zip(told, found.mean, std, strict=True):
+        assert e.std <= 1.001 * own
+        assert abs(e.value - mean) < own
+
+
+def test_a_model_that_lacks_something_else_is_contradicted() -> None:
+    log, _ = record_walk(Gait(), 6.0, delay=0.04, seed=2)
+    problem, begin = problem_of(make_study(load_robot("nao"), [log]))
+    assert without_ground(problem, begin) is None
+
+
+def test_logs_that_do_not_suit_are_left_alone(on_springs: tuple[ground.Walker, Log]) -> None:
+    _, log = on_springs
+    problem, _ = problem_of(make_study(load_robot("nao"), [log]))
+    replay = problem.episodes[0].replay
+    assert isinstance(replay, WindowReplay)
+    assert contact_free._suits(replay)
+    time = replay.log.time.copy()
+    time[1::2] += 0.003
+    assert not contact_free._suits(replace(replay, log=replace(replay.log, time=time)))
+    assert not contact_free._suits(replace(replay, numerics=replace(replay.numerics, servo_period=0.01)))
+    short = replay.log.window(0, contact_free.LEAST - 1)
+    assert not contact_free._suits(replace(replay, log=short))

@@ -1,0 +1,148 @@
+"""The parameter grammar: what it accepts, how it groups, and what its errors tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from toys import SCALE, leg, pendulum
+
+from sysid_btr.errors import UsageError
+from sysid_btr.models.emps import emps
+from sysid_btr.models.nao import PAPER_BOUNDS, STARRED, nao
+from sysid_btr.terms.fields import FIELDS
+from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.scales import JointScale
+
+LEG = leg()
+NAO = nao()
+
+
+def names(*expressions: str) -> list[str]:
+    return [p.name for m in parse_parameters(expressions, LEG) for p in m.parameters]
+
+
+def test_globs_match_in_model_order_and_each_name_once() -> None:
+    assert names("mass:*") == ["mass:hip", "mass:knee", "mass:ankle"]
+    assert names("kp:k*,*p,knee") == ["kp:knee", "kp:hip"]
+    assert names("damping:[hk]*") == ["damping:hip", "damping:knee"]
+
+
+def test_shared_is_one_number_for_all_matches() -> None:
+    (term,) = parse_parameters(["kp:*=shared"], LEG)
+    assert term.places == ("hip", "knee", "ankle")
+    assert [p.name for p in term.parameters] == ["kp:*"]
+    (single,) = parse_parameters(["kp:knee=shared"], LEG)
+    assert len(single.parameters) == 1
+
+
+def test_a_centre_of_mass_is_three_numbers_a_body() -> None:
+    assert names("com:knee") == ["com.x:knee", "com.y:knee", "com.z:knee"]
+
+
+@pytest.mark.parametrize(
+    ("expression", "told"),
+    [
+        ("mass:toe", ("'toe'", "body", "hip, knee, ankle")),
+        ("kp:elbow", ("'elbow'", "joint with a servo", "hip, knee, ankle")),
+        ("mas:knee", ("'mas'", "did you mean 'mass'", "frictionloss")),
+        ("mass", ("FIELD:GLOB",)),
+        ("mass:", ("FIELD:GLOB",)),
+        ("mass:knee=same", ("'same'", "shared")),
+        ("mass:knee,,hip", ("''", "body")),
+    ],
+)
+def test_an_error_says_what_is_wrong_and_what_there_is(expression: str, told: tuple[str, ...]) -> None:
+    with pytest.raises(UsageError) as caught:
+        parse_parameters([expression], LEG)
+    message = str(caught.value)
+    assert f"--fit {expression}" in message
+    for part in told:
+        assert part in message
+
+
+def test_all_problems_are_told_at_once() -> None:
+    with pytest.raises(UsageError) as caught:
+        parse_parameters(["mass:toe", "kp:*", "nonsense:*", "kp:knee"], LEG)
+    message = str(caught.value)
+    assert all(part in message for part in ("'toe'", "'nonsense'", "kp:knee is already freed by 'kp:*'"))
+
+
+PLACES = st.lists(st.sampled_from(["hip", "knee", "ankle", "*", "k*"]), min_size=1, max_size=3).map(",".join)
+EXPRESSIONS = st.lists(
+    st.tuples(st.sampled_from(["mass", "kp", "damping"]), PLACES, st.sampled_from(["", "=shared"])).map(
+        lambda t: f"{t[0]}:{t[1]}{t[2]}"
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+@given(EXPRESSIONS)
+def test_no_number_is_ever_freed_twice(expressions: list[str]) -> None:
+    try:
+        terms = parse_parameters(expressions, LEG)
+    except UsageError as error:
+        assert "already freed" in str(error)  # noqa: PT017 - a success is checked below
+        return
+    freed = [(m.name, place) for m in terms for place in m.places]
+    assert len(freed) == len(set(freed))
+    labels = [p.name for m in terms for p in m.parameters]
+    assert len(labels) == len(set(labels))
+
+
+@pytest.mark.parametrize("field", sorted(FIELDS))
+@pytest.mark.parametrize("sized", [False, True])
+def test_bounds_hold_the_nominal_and_scales_are_positive(field: str, sized: bool) -> None:
+    scales = {"knee": SCALE} if sized else None
+    for term in parse_parameters([f"{field}:knee"], LEG, scales):
+        for p in term.parameters:
+            assert p.lower <= p.nominal <= p.upper
+            assert p.lower < p.upper < float("inf")
+            assert 0 < p.scale < p.upper - p.lower
+            assert p.unit
+
+
+def test_units_of_a_slide_are_those_of_forces_and_lengths() -> None:
+    slide = replace(SCALE, slide=True)
+    for scales in (None, {"slider": slide}):
+        units = {
+            p.name: p.unit
+            for m in parse_parameters(
+                ["damping:*", "frictionloss:*", "constant_force:*", "qpos0:*"], emps(), scales
+            )
+            for p in m.parameters
+        }
+        assert units == {
+            "damping:slider": "N s/m",
+            "frictionloss:slider": "N",
+            "constant_force:slider": "N",
+            "qpos0:slider": "m",
+        }
+
+
+def test_joints_on_one_motor_have_one_gain() -> None:
+    (term,) = parse_parameters(["kp:*HipYawPitch"], NAO)
+    assert set(term.places) == {"RHipYawPitch", "LHipYawPitch"}
+    assert len(term.parameters) == 1
+    assert len(parse_parameters(["kp:*"], NAO)) == 21
+    assert len(parse_parameters(["mass:*HipYawPitch"], NAO)) == 2, "two bodies on one motor have two masses"
+
+
+def test_the_papers_search_space() -> None:
+    robot = replace(NAO, bounds=PAPER_BOUNDS)
+    parameters = [p for m in parse_parameters(["mass:" + ",".join(STARRED)], robot) for p in m.parameters]
+    assert len(parameters) == 8
+    assert all((p.lower, p.upper) == (0.5, 1.5) for p in parameters)
+    (other,) = parse_parameters(["mass:Torso"], robot)
+    assert other.parameters[0].upper == 3.0
+
+
+@pytest.mark.parametrize("key", ["damping:arm", "damping"])
+def test_a_robots_own_bounds_win(key: str) -> None:
+    robot = replace(pendulum(), bounds={key: (0.01, 0.2)})
+    scales: dict[str, JointScale] = {"arm": SCALE}
+    (term,) = parse_parameters(["damping:arm"], robot, scales)
+    assert (term.parameters[0].lower, term.parameters[0].upper) == (0.01, 0.2)
