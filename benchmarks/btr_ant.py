@@ -26,7 +26,7 @@ from sysid_btr.btr.task import Walk
 from sysid_btr.btr.world import make_world
 from sysid_btr.estimators import Budget, GeneticAlgorithm, Journal, silent
 from sysid_btr.models.ant import UNKNOWN
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.terms.grammar import parse_parameters
 
 RANGE = (0.75, 1.25)

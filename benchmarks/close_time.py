@@ -28,7 +28,7 @@ from sysid_btr.executors.base import Executor
 from sysid_btr.executors.pool import DaskExecutor
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.request import DECLARED
 from sysid_btr.result import make_result
 

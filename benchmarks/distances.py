@@ -32,14 +32,15 @@ from typing import Any
 import numpy as np
 
 from sysid_btr.estimators import Budget, CmaEs, Journal, silent
+from sysid_btr.identify.replay import set_parameters
 from sysid_btr.io.log import Log, LogMeta
-from sysid_btr.models.robot import Robot, load_robot
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.distance import Distance, DistanceProblem, MeanSquare, Phi1, Phi2, Wasserstein
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.result import to_json
 from sysid_btr.simulation.engine import Numerics, Replay
-from sysid_btr.simulation.log import set_parameters
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 

@@ -55,7 +55,7 @@ class Source:
     def problem(self, threads: int) -> ReplayProblem:
         from sysid_btr.identify.study import make_study
         from sysid_btr.io.parquet import read_log
-        from sysid_btr.models.robot import load_robot
+        from sysid_btr.models.builtin import load_robot
 
         robot: Robot = load_robot(self.model)
         log: Log = read_log(self.log)

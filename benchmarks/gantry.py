@@ -127,7 +127,7 @@ def examine(folder: Path, letter: str, threads: int, out: Path | None) -> Outcom
     from sysid_btr.diagnosis.close import close
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
-    from sysid_btr.models.robot import load_robot
+    from sysid_btr.models.builtin import load_robot
     from sysid_btr.result import make_result, to_json
 
     model = folder / "nominal.xml"

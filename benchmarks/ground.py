@@ -21,8 +21,8 @@ from benchmarks.walks import CONTACT, INERTIAL
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
-from sysid_btr.models.robot import load_robot
 
 if TYPE_CHECKING:
     from numpy.random import Generator

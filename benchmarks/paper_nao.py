@@ -27,16 +27,17 @@ import numpy as np
 from sysid_btr.estimators import Budget, GeneticAlgorithm, Journal, silent
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.replay import replay_log
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
 from sysid_btr.models.nao import PAPER_BOUNDS, STARRED
-from sysid_btr.models.robot import Robot, load_robot
+from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.distance import Distance, DistanceProblem, MeanSquare, Phi2
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.result import to_json
 from sysid_btr.simulation.engine import Numerics, Replay
-from sysid_btr.simulation.log import replay_log
 from sysid_btr.terms.grammar import parse_parameters
 
 RESULTS = Path(__file__).parent / "results"

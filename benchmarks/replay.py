@@ -24,12 +24,13 @@ import numpy as np
 
 import sysid_btr
 from sysid_btr._typing import FloatArray
+from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import Robot, load_robot
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.engine import CHUNK, Numerics, Replay
-from sysid_btr.simulation.numerics import choose_numerics
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent

@@ -21,12 +21,13 @@ from sysid_btr.estimators import get_estimator
 from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import fit
+from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
-from sysid_btr.models.robot import Robot, joint_names, load_robot, robot_from_spec, servo_joints
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import Robot, joint_names, robot_from_spec, servo_joints
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.engine import Numerics
-from sysid_btr.simulation.log import replay_log
 from sysid_btr.terms.library import select_effects
 
 NUMERICS = Numerics("implicitfast", 0.005)

@@ -26,7 +26,7 @@ from sysid_btr.floating_base.walk import make_walk
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.result import make_result, to_json
 
 RESULTS = Path(__file__).parent / "results" / "walks.json"

@@ -12,34 +12,34 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from sysid_btr.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.close import close
     from sysid_btr.executors import open_executor
     from sysid_btr.identify.fit import fit
+    from sysid_btr.identify.replay import replay_log
     from sysid_btr.identify.study import make_study
     from sysid_btr.importing import import_log
     from sysid_btr.io.parquet import read_log, write_log
     from sysid_btr.io.validation import validate_file, validate_log
-    from sysid_btr.models.robot import load_robot
+    from sysid_btr.models.builtin import load_robot
     from sysid_btr.posterior import posterior
     from sysid_btr.result import read_result
-    from sysid_btr.session import save
-    from sysid_btr.simulation.log import replay_log
-
-__version__ = "0.1.0"
+    from sysid_btr.saving import save
 
 _HOME = {
     "close": "sysid_btr.diagnosis.close",
     "fit": "sysid_btr.identify.fit",
     "import_log": "sysid_btr.importing",
-    "load_robot": "sysid_btr.models.robot",
+    "load_robot": "sysid_btr.models.builtin",
     "make_study": "sysid_btr.identify.study",
     "open_executor": "sysid_btr.executors",
     "posterior": "sysid_btr.posterior",
     "read_log": "sysid_btr.io.parquet",
     "read_result": "sysid_btr.result",
-    "replay_log": "sysid_btr.simulation.log",
-    "save": "sysid_btr.session",
+    "replay_log": "sysid_btr.identify.replay",
+    "save": "sysid_btr.saving",
     "validate_file": "sysid_btr.io.validation",
     "validate_log": "sysid_btr.io.validation",
     "write_log": "sysid_btr.io.parquet",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from sysid_btr.errors import InterruptedRun, LogError, LostCluster, SysidError, UsageError
+from sysid_btr.progress import Interrupted, ProgressLine, interruptible
 from sysid_btr.request import (
     Keeper,
     Request,
@@ -29,7 +30,8 @@ from sysid_btr.request import (
     what_can_be_freed,
     with_params,
 )
-from sysid_btr.session import Folder, Interrupted, ProgressLine, as_model, interruptible, write_all
+from sysid_btr.run_folder import Folder
+from sysid_btr.saving import as_model, write_all
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
@@ -285,7 +287,8 @@ def validate(
     """Say everything that is wrong with a log, where, and what to do about it (exit 3 on errors)."""
     from sysid_btr.io.problem import errors_of
     from sysid_btr.io.validation import validate_file
-    from sysid_btr.models.robot import joint_names, joint_ranges, load_robot
+    from sysid_btr.models.builtin import load_robot
+    from sysid_btr.models.robot import joint_names, joint_ranges
 
     paths = [*(files or []), *(log or [])]
     if not paths:
@@ -357,10 +360,11 @@ def import_(
     Every column or topic that is not understood is told. A table whose columns cannot be guessed gets a mapping
     file on standard output, to fill in. With errors in it the log is not written (exit 3), unless --force is given.
     """
+    from sysid_btr.importing import known_model
     from sysid_btr.io.importers.base import MappingNeeded
     from sysid_btr.io.importers.mapping import read_map, with_flags
     from sysid_btr.io.importers.run import import_log
-    from sysid_btr.request import known_model, output_file, pairs
+    from sysid_btr.request import output_file, pairs
 
     target = output_file(out, files or [], overwrite)
     known = known_model(model)
@@ -465,11 +469,11 @@ def replay(
 
     A motion that was not recorded yet (excite.parquet) is only played: where every joint goes, and the predicted log.
     """
+    from sysid_btr.identify.replay import replay_log, set_parameters
     from sysid_btr.identify.scores import score_problem
     from sysid_btr.identify.study import make_study
     from sysid_btr.objectives.targets import COMPARED
     from sysid_btr.result import replay_result
-    from sysid_btr.simulation.log import replay_log, set_parameters
 
     began = time.perf_counter()
     robot = find_robot(model, None)
@@ -1069,10 +1073,10 @@ def _rehearse(
     """Play motions in the model; say how far every joint goes."""
     from itertools import zip_longest
 
+    from sysid_btr.identify.replay import replay_log
     from sysid_btr.io.parquet import write_log
     from sysid_btr.report.motion import reach, reach_table
     from sysid_btr.report.text import console
-    from sysid_btr.simulation.log import replay_log
 
     if not all(one.is_motion for one in motions):
         raise UsageError("--log: motions to be played and recordings; give one or the other")

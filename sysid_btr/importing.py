@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from sysid_btr.io.importers.base import Importer
-    from sysid_btr.io.importers.run import Imported
+    from sysid_btr.io.importers.run import Imported, KnownModel
     from sysid_btr.models.robot import Robot
 
     PathLike = str | os.PathLike[str]
@@ -55,7 +55,6 @@ def import_log(
     """
     from sysid_btr.io.importers.mapping import read_map, with_flags
     from sysid_btr.io.importers.run import import_log as read
-    from sysid_btr.request import known_model
 
     told = with_flags(
         read_map(None if mapping is None else Path(mapping)),
@@ -65,3 +64,18 @@ def import_log(
     )
     paths = [source] if isinstance(source, str | os.PathLike) else list(source)
     return read(paths, importer=importer, told=told, model=known_model(model))
+
+
+def known_model(wanted: str | Robot | None) -> KnownModel | None:
+    """What an import wants to know of the robot called for by name or file, or given, if one is."""
+    if wanted is None:
+        return None
+    from sysid_btr.io.importers.run import KnownModel
+    from sysid_btr.models.builtin import load_robot
+    from sysid_btr.models.robot import joint_names, joint_ranges
+
+    robot = load_robot(wanted) if isinstance(wanted, str) else wanted
+    model = robot.compile()
+    joints = joint_names(robot)
+    sliding = tuple(joint for joint in joints if int(model.joint(joint).type[0]) == 2)
+    return KnownModel(robot.name, joints, joint_ranges(robot), sliding)

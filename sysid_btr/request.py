@@ -9,16 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sysid_btr import __version__
 from sysid_btr.errors import LogError, UsageError
-from sysid_btr.session import Folder, open_folder
+from sysid_btr.run_folder import Folder, open_folder
+from sysid_btr.version import __version__
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.estimators.journal import Journal
     from sysid_btr.executors.base import Executor
     from sysid_btr.identify.study import Study
-    from sysid_btr.io.importers.run import KnownModel
     from sysid_btr.io.log import Log
     from sysid_btr.models.robot import Robot
     from sysid_btr.simulation.engine import Numerics
@@ -112,8 +111,7 @@ def find_robot(name: str | None, bounds: list[str] | None) -> Robot:
     """The robot called for, with the bounds given to its parameters."""
     from dataclasses import replace
 
-    from sysid_btr.models.builtin import BUILTIN
-    from sysid_btr.models.robot import load_robot
+    from sysid_btr.models.builtin import BUILTIN, load_robot
 
     if name is None:
         built_in = f" ({', '.join(sorted(BUILTIN))})" if BUILTIN else ""
@@ -250,7 +248,7 @@ def start_values(parameters: Sequence[Parameter], given: list[str] | None) -> Fl
 def params_digest(path: Path | None) -> str | None:
     """Digest of a parameter file that a search begins from."""
     from sysid_btr.io.parquet import sha256
-    from sysid_btr.session import PARAMS
+    from sysid_btr.run_folder import PARAMS
 
     if path is None:
         return None
@@ -360,20 +358,6 @@ def replay_targets(out: Path | None, logs: Sequence[Log], overwrite: bool) -> li
     except OSError as error:
         raise UsageError(f"--out {out} cannot be created: {error.strerror}; choose another folder") from error
     return targets
-
-
-def known_model(wanted: str | Robot | None) -> KnownModel | None:
-    """What an import wants to know of the robot called for by name or file, or given, if one is."""
-    if wanted is None:
-        return None
-    from sysid_btr.io.importers.run import KnownModel
-    from sysid_btr.models.robot import joint_names, joint_ranges, load_robot
-
-    robot = load_robot(wanted) if isinstance(wanted, str) else wanted
-    model = robot.compile()
-    joints = joint_names(robot)
-    sliding = tuple(joint for joint in joints if int(model.joint(joint).type[0]) == 2)
-    return KnownModel(robot.name, joints, joint_ranges(robot), sliding)
 
 
 def pairs(flag: str, given: list[str] | None) -> list[tuple[str, str]]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr.errors import UsageError
-from sysid_btr.units import si_all
+from sysid_btr.units import CHANNEL_UNITS, si_all
 
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord
@@ -32,12 +32,6 @@ if TYPE_CHECKING:
 SCHEMA = "sysid_btr.result/1"
 NOTICEABLE_GAIN = 2.0
 """Log-likelihood of a draw over the fit's beyond which the fit was not the minimum."""
-CHANNEL_UNITS = {
-    "position": ("rad", "m"),
-    "velocity": ("rad/s", "m/s"),
-    "effort": ("Nm", "N"),
-}
-"""Unit of a channel for hinges and for slides."""
 
 
 def make_result(outcome: Fit | Closing | Posterior, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
@@ -343,7 +337,7 @@ def versions() -> dict[str, str]:
     import mujoco
     import scipy
 
-    from sysid_btr import __version__
+    from sysid_btr.version import __version__
 
     return {
         "sysid_btr": __version__,

@@ -8,6 +8,12 @@ from collections.abc import Sequence
 PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 PREFIXED = ("rad", "m", "rad/s", "m/s", "Nm", "N", "s")
 """Units that people read with a prefix."""
+CHANNEL_UNITS = {
+    "position": ("rad", "m"),
+    "velocity": ("rad/s", "m/s"),
+    "effort": ("Nm", "N"),
+}
+"""Unit of a channel for hinges and for slides."""
 
 
 def si(value: float | None, unit: str, digits: int = 3) -> str:

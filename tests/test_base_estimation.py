@@ -18,8 +18,8 @@ from sysid_btr.floating_base.feet import force_columns, points_in_base, touching
 from sysid_btr.floating_base.smoothing import smooth_joints
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
-from sysid_btr.models.robot import load_robot
 from sysid_btr.simulation.engine import Numerics, compile_model, make_index
 
 INNER = slice(10, -10)

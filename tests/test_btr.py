@@ -34,7 +34,7 @@ from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.validation import validate_log
 from sysid_btr.models import ant as ant_module
 from sysid_btr.models.ant import SegmentLength
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.btr import draw_btr
 from sysid_btr.result import to_json
 from sysid_btr.simulation.engine import Replay, make_index

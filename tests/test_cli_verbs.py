@@ -18,12 +18,12 @@ from terminal import Cli
 from sysid_btr.cli import app, run
 from sysid_btr.config import StudyFile
 from sysid_btr.demo import cases
+from sysid_btr.identify.replay import replay_log
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.result import read_result
 from sysid_btr.simulation.engine import Numerics
-from sysid_btr.simulation.log import replay_log
 
 MASS, KP, FRICTION = 1.2, 0.9, 0.1
 PENDULUM = """

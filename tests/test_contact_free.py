@@ -16,8 +16,8 @@ from sysid_btr.floating_base.fusion import weigh_walks
 from sysid_btr.identify.intervals import Known, estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
-from sysid_btr.models.robot import load_robot
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
 

@@ -23,8 +23,8 @@ from sysid_btr.identify.refit import refit
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.emps import emps
-from sysid_btr.models.robot import load_robot
 from sysid_btr.terms.cogging import Cogging
 from sysid_btr.terms.coulomb_friction import CoulombFriction
 from sysid_btr.terms.effect import Effect

@@ -14,7 +14,7 @@ from sysid_btr.estimators.chain import Chain
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.testing import LossOnly, Witness, check_estimator, exponential_decay, rosenbrock, run
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"

@@ -26,7 +26,8 @@ from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log
 from sysid_btr.io.validation import validate_file
-from sysid_btr.models.robot import joint_names, load_robot
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import joint_names
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 

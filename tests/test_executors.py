@@ -51,7 +51,7 @@ SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 @cache
 def leg_log(seconds: float = 2.0) -> Log:
     """A leg heavier than its model, with noise."""
-    from sysid_btr.simulation.log import replay_log
+    from sysid_btr.identify.replay import replay_log
 
     log = toys.swing(toys.LEG_JOINTS, seconds)
     run = replay_log(toys.leg(), log, {"mass:knee": 1.3}, numerics=QUICK)

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.errors import UsageError
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait, leg_angles
-from sysid_btr.models.robot import load_robot
 
 PERIOD = 0.02
 

@@ -22,7 +22,8 @@ from sysid_btr.identify.intervals import Estimate, covariance, estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import Robot, load_robot
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.engine import Numerics
 from sysid_btr.terms.base import Parameter
@@ -62,7 +63,7 @@ TWO_LIMBS = """
 
 def measured(robot: Robot, log: Log, scales: Mapping[str, float] | None = None, seed: int = 0) -> Log:
     """The log with positions of a robot whose parameters differ, through a 12-bit encoder with noise."""
-    from sysid_btr.simulation.log import replay_log
+    from sysid_btr.identify.replay import replay_log
 
     run = replay_log(robot, log, scales or {}, numerics=Numerics("RK4", 0.00125))
     rng = np.random.default_rng(seed)

@@ -14,7 +14,7 @@ from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.profile import chosen_names, profile, profile_curve
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.terms.base import Parameter
 from sysid_btr.testing import ToyProblem, linear_gaussian
 

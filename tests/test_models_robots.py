@@ -11,14 +11,15 @@ import pytest
 from toys import make_log, position, run, with_spec
 
 from sysid_btr.errors import LogError, ModelError
+from sysid_btr.identify.numerics import PAPER_TIMING, choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.emps import emps
 from sysid_btr.models.nao import FEET, STARRED, nao, nao_table1
-from sysid_btr.models.robot import Robot, joint_names, joint_ranges, load_robot, servo_joints
+from sysid_btr.models.robot import Robot, joint_names, joint_ranges, servo_joints
 from sysid_btr.models.xl330 import TORQUE_PER_VOLT, xl330
 from sysid_btr.simulation.engine import Numerics, Replay
-from sysid_btr.simulation.numerics import PAPER_TIMING, choose_numerics
 from sysid_btr.terms.grammar import parse_parameters
 
 TABLE1 = """

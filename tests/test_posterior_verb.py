@@ -17,7 +17,7 @@ from sysid_btr.estimators import Budget
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.optional import optional
 from sysid_btr.posterior.draw import Posterior, posterior
 from sysid_btr.posterior.sampling import Settings

@@ -20,7 +20,7 @@ from sysid_btr.demo import sample_logs
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.figures import correlate, plot_convergence, plot_overlay, plot_residuals, trace_outcome
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.style import DARK, LIGHT, ink, page

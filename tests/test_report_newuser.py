@@ -233,7 +233,7 @@ def test_whatever_else_cannot_be_written_is_no_defect(
     def closed(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "somewhere")
 
-    monkeypatch.setattr("sysid_btr.session.write_all", closed)
+    monkeypatch.setattr("sysid_btr.saving.write_all", closed)
     monkeypatch.setattr("sysid_btr.cli.write_all", closed)
     answer = cli("fit", *ASKED, "--out", tmp_path / "out")
     assert answer.code == 2

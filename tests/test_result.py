@@ -17,7 +17,7 @@ from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import ChannelScore, Scores
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
-from sysid_btr.models.robot import load_robot
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.text import console, show
 from sysid_btr.result import clean, exit_code, make_result, read_result, to_json

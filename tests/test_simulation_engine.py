@@ -28,12 +28,12 @@ from toys import (
 )
 
 from sysid_btr.errors import ModelError
+from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.simulation import engine
 from sysid_btr.simulation.batching import chunks_together, parties
 from sysid_btr.simulation.engine import Numerics, Replay
 from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps
-from sysid_btr.simulation.numerics import choose_numerics
 from sysid_btr.simulation.start import initial_state
 from sysid_btr.terms.coulomb_friction import CoulombFriction
 from sysid_btr.terms.grammar import parse_parameters

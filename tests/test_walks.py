@@ -30,16 +30,16 @@ from sysid_btr.floating_base.walk import (
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
-from sysid_btr.models.robot import load_robot
 from sysid_btr.objectives.marginal import Marginal, projections
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.engine import Numerics
-from sysid_btr.simulation.log import replay_log
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows, on_slope
 from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.constant_force import ConstantForce

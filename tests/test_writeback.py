@@ -27,9 +27,10 @@ from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
-from sysid_btr.models.robot import Robot, load_robot
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import Robot
 from sysid_btr.report.changes import change_lines, model_lines
-from sysid_btr.session import Folder
+from sysid_btr.run_folder import Folder
 from sysid_btr.simulation.engine import Numerics
 from sysid_btr.terms.backlash import Backlash
 from sysid_btr.terms.base import Term

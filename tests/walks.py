@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
-from sysid_btr.models.robot import load_robot
 
 TICK = 2 * np.pi / 4096
 PERIOD = 0.02

@@ -113,7 +113,7 @@ def examine(case: Case, code: str, recipe: str, out: Path, threads: int = 0) -> 
     from sysid_btr.diagnosis.close import close
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
-    from sysid_btr.models.robot import load_robot as load_model
+    from sysid_btr.models.builtin import load_robot as load_model
     from sysid_btr.result import make_result, to_json
 
     path = HERE / "logs" / recipe / f"{case.id.replace('/', '_')}.parquet"

@@ -84,8 +84,8 @@ class Case:
         """
         if numerics is None:
             return record(self.spec)[0]
-        from sysid_btr.models.robot import load_robot
-        from sysid_btr.simulation.log import replay_log
+        from sysid_btr.identify.replay import replay_log
+        from sysid_btr.models.builtin import load_robot
 
         exact = Sensors(bits=0, position_noise=0.0)
         log, _ = record(replace(self.spec, sensors=exact))

@@ -44,9 +44,9 @@ ESTIMATORS: Mapping[str, Callable[[Fit], Outcome]] = {"lsq": least_squares, "pos
 def examine(case: Case, estimator: str, plant: str, threads: int = 1) -> list[Row]:
     """One row a declared parameter."""
     from sysid_btr.identify.fit import fit
+    from sysid_btr.identify.numerics import choose_numerics
     from sysid_btr.identify.study import make_study
-    from sysid_btr.models.robot import load_robot
-    from sysid_btr.simulation.numerics import choose_numerics
+    from sysid_btr.models.builtin import load_robot
 
     robot = load_robot(str(case.bench.model))
     log = case.log()

@@ -36,7 +36,7 @@ def examine_gantry(number: int, estimator: str, threads: int = 1) -> list[Row]:
     from sysid_btr.identify.fit import fit
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
-    from sysid_btr.models.robot import load_robot
+    from sysid_btr.models.builtin import load_robot
 
     folder = recordings()
     assert folder is not None

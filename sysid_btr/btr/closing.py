@@ -17,7 +17,7 @@ from sysid_btr.errors import SysidError
 from sysid_btr.estimators.base import Budget, Progress, Termination, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot
-from sysid_btr.session import Folder
+from sysid_btr.run_folder import Folder
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect
 

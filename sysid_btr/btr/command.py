@@ -10,8 +10,9 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.errors import InterruptedRun, UsageError
+from sysid_btr.progress import Interrupted, ProgressLine
 from sysid_btr.request import remark, what_can_be_freed
-from sysid_btr.session import OVERLAY, RESULT, Folder, Interrupted, ProgressLine, open_folder
+from sysid_btr.run_folder import OVERLAY, RESULT, Folder, open_folder
 
 if TYPE_CHECKING:
     from sysid_btr.btr.controllers import ControllerSpace
@@ -92,8 +93,8 @@ class Asked:
         from sysid_btr.btr.exchange import FolderExchange
         from sysid_btr.btr.robot import HiddenRobot, Noise
         from sysid_btr.btr.world import make_world
-        from sysid_btr.models.robot import load_robot
-        from sysid_btr.simulation.log import set_parameters
+        from sysid_btr.identify.replay import set_parameters
+        from sysid_btr.models.builtin import load_robot
 
         if (self.robot_sim is None) == (self.exchange is None):
             raise UsageError(

@@ -27,7 +27,7 @@ from sysid_btr.io.log import MOTION, Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.problem import errors_of
 from sysid_btr.io.validation import validate_log
-from sysid_btr.session import Folder
+from sysid_btr.run_folder import Folder
 
 SCHEMA = "sysid_btr.exchange/1"
 REQUEST, COMMAND, RECORDED, REPLY, PROBLEMS = (

@@ -16,7 +16,6 @@ from time import perf_counter
 
 import numpy as np
 
-from sysid_btr import __version__
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.choice import Pool, get_choice, pool_of
 from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
@@ -40,6 +39,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.models.robot import Robot as Model
 from sysid_btr.objectives.distance import get_distance
 from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.version import __version__
 
 PATIENCE = 3
 """Iterations without progress after which disengagement is looked for."""

@@ -14,7 +14,7 @@ from sysid_btr.btr.robot import OUTCOMES, Robot, Trial
 from sysid_btr.errors import UsageError
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.result import clean
-from sysid_btr.session import Folder
+from sysid_btr.run_folder import Folder
 
 SCHEMA = "sysid_btr.trial/1"
 

@@ -27,14 +27,15 @@ from sysid_btr.estimators.lsq import linearise
 from sysid_btr.estimators.registry import get_estimator
 from sysid_btr.excite.motion import MARGIN, Clock, Family, as_log, find_motors
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, estimates
-from sysid_btr.identify.study import measure_scales, nominal_start, split_episodes
+from sysid_btr.identify.numerics import choose_numerics
+from sysid_btr.identify.study import measure_scales, nominal_start
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.split import split_episodes
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.engine import Numerics, Replay
-from sysid_btr.simulation.numerics import choose_numerics
 from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.grammar import parse_parameters
 

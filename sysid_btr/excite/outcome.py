@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from sysid_btr.excite.design import Design
     from sysid_btr.identify.intervals import Estimate
-    from sysid_btr.session import Folder
+    from sysid_btr.run_folder import Folder
 
 MOTION, FIGURE = "excite.parquet", "excite"
 MOTORS_SHOWN = 6
@@ -217,7 +217,7 @@ def write_all(folder: Folder, design: Design, result: dict[str, Any]) -> Path:
     """
     from sysid_btr.io.parquet import write_log
     from sysid_btr.report.pictures import keep, write_report
-    from sysid_btr.session import RESULT
+    from sysid_btr.run_folder import RESULT
 
     write_log(design.log, folder.path / MOTION, overwrite=True)
     result["pictures"] = keep(folder, [(FIGURE, lambda: plot_motion(design))])

@@ -59,7 +59,7 @@ class Shelf:
 
 def versions() -> dict[str, str]:
     """What must be the same everywhere for the same bits."""
-    from sysid_btr import __version__
+    from sysid_btr.version import __version__
 
     found = {"sysid-btr": __version__, "Python": ".".join(platform.python_version_tuple()[:2])}
     return found | {name: version(name) for name in ("mujoco", "numpy", "scipy")}

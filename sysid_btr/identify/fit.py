@@ -19,12 +19,12 @@ from sysid_btr.floating_base.fusion import weigh_walks
 from sysid_btr.floating_base.walk import Walk
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, Known, estimates, newton
+from sysid_btr.identify.numerics import held_numerics
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
-from sysid_btr.simulation.numerics import held_numerics
 from sysid_btr.terms.base import Term
 
 if TYPE_CHECKING:

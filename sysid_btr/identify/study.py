@@ -24,13 +24,13 @@ from sysid_btr.floating_base.walk import (
     settle,
     walk_numerics,
 )
+from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
-from sysid_btr.io.split import holdout_split
+from sysid_btr.io.split import holdout_split, split_episodes
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.engine import Numerics, Replay, make_index
-from sysid_btr.simulation.numerics import choose_numerics
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.scales import JointScale, Scales
@@ -275,11 +275,6 @@ def make_study(
 def _ready(robot: Robot, episode: Log) -> Log:
     """An episode with its base reconstructed, if that was free."""
     return make_walk(robot, episode) if episode.meta.mount == "free" else episode
-
-
-def split_episodes(log: Log) -> list[Log]:
-    """Each episode of a log as a log of its own."""
-    return [log.window(rows.start, rows.stop) for rows in log.episodes() if rows.stop - rows.start > 1]
 
 
 def measure_scales(

@@ -46,3 +46,8 @@ def holdout_split(log: Log, holdout: float = 0.3) -> tuple[Log, Log]:
             "record more, or give a second log to hold out"
         )
     return log.window(0, cut), log.window(cut, len(log))
+
+
+def split_episodes(log: Log) -> list[Log]:
+    """Each episode of a log as a log of its own."""
+    return [log.window(rows.start, rows.stop) for rows in log.episodes() if rows.stop - rows.start > 1]

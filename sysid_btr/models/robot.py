@@ -63,28 +63,6 @@ class Robot:
             raise ModelError(f"model {self.name}: MuJoCo cannot compile it: {error}") from error
 
 
-def load_robot(name: str) -> Robot:
-    """A built-in robot by name, or any MJCF or URDF by path.
-
-    Raises
-    ------
-    ModelError
-        Unknown name, missing file, or a file that MuJoCo cannot read.
-    """
-    from sysid_btr.models.builtin import BUILTIN
-
-    if name in BUILTIN:
-        return BUILTIN[name]()
-    path = Path(name)
-    if not path.is_file():
-        listing = ", ".join(sorted(BUILTIN))
-        raise ModelError(
-            f"model {name!r}: neither a built-in model ({listing}) nor an existing file. "
-            "Give one of these names, or the path of an MJCF or URDF file."
-        )
-    return robot_from_file(path)
-
-
 def robot_from_file(path: Path) -> Robot:
     """Any MJCF or URDF as a robot."""
     import mujoco

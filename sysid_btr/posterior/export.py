@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr import __version__
 from sysid_btr.optional import optional
+from sysid_btr.version import __version__
 
 if TYPE_CHECKING:
     from sysid_btr.posterior.draw import Posterior

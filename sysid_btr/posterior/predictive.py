@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.units import CHANNEL_UNITS
 
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
@@ -130,7 +131,5 @@ def _fitted_error(problem: ReplayProblem, values: FloatArray) -> Mapping[tuple[s
 
 
 def _unit(channel: str, model: object, joint: str) -> str:
-    from sysid_btr.result import CHANNEL_UNITS
-
     slide = int(model.joint(joint).type[0]) == 2  # type: ignore[attr-defined]
     return CHANNEL_UNITS[channel][slide]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.style import on_page
-from sysid_btr.session import OVERLAY, REPORT, RESULT, Folder
+from sysid_btr.run_folder import OVERLAY, REPORT, RESULT, Folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
-    from sysid_btr.session import Folder
+    from sysid_btr.run_folder import Folder
 
 Frames = np.ndarray[Any, np.dtype[np.uint8]]
 PICTURE, ANIMATION = "render.png", "render.gif"

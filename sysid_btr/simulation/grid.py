@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.models.interpolation import hermite
+from sysid_btr.interpolation import hermite
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log

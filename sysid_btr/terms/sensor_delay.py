@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.models.interpolation import hermite
+from sysid_btr.interpolation import hermite
 from sysid_btr.terms.base import Kind, Outputs, Rig
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale

@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.session import PARAMS
+from sysid_btr.run_folder import PARAMS
 from sysid_btr.terms.base import Parameter, Term
 
 if TYPE_CHECKING:

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr import __version__
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError, SysidError
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import Robot
 from sysid_btr.result import clean, model_entry, to_json
-from sysid_btr.session import MODEL, PARAMS, Folder
+from sysid_btr.run_folder import MODEL, PARAMS, Folder
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect
+from sysid_btr.version import __version__
 from sysid_btr.writeback.changes import SOLVER, Change, changes_of, describe
 from sysid_btr.writeback.features import Kind
 from sysid_btr.writeback.filed import loss_of, of_file, stands_alone

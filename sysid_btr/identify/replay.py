@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr.errors import UsageError
+from sysid_btr.identify.numerics import choose_numerics
+from sysid_btr.io.split import split_episodes
 from sysid_btr.simulation.engine import Numerics, Replay
-from sysid_btr.simulation.numerics import choose_numerics
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 
@@ -50,8 +51,6 @@ def replay_log(
     UsageError
         A parameter that the model does not have, or a value that is not finite.
     """
-    from sysid_btr.identify.study import split_episodes
-
     terms, values = (
         parameters if isinstance(parameters, tuple) else set_parameters(robot, parameters or {})
     )
