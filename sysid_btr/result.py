@@ -22,8 +22,7 @@ from sysid_btr.units import CHANNEL_UNITS, si_all
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.identify.intervals import Estimate
-    from sysid_btr.identify.profile import Profile
+    from sysid_btr.identify.intervals import Estimate, Profile
     from sysid_btr.identify.scores import ChannelScore, Scores
     from sysid_btr.identify.study import Study
     from sysid_btr.models.robot import Robot

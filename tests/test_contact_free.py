@@ -12,12 +12,13 @@ from walks import record_walk
 from benchmarks import ground
 from sysid_btr.floating_base import contact_free
 from sysid_btr.floating_base.contact_free import difference, without_ground
-from sysid_btr.floating_base.fusion import weigh_walks
-from sysid_btr.identify.intervals import Known, estimates
+from sysid_btr.identify.fusion import weigh_walks
+from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
+from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
 

@@ -18,12 +18,13 @@ from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.fit import Fit, fewest_to_hold, fit
-from sysid_btr.identify.intervals import Estimate, covariance, estimates
+from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
+from sysid_btr.objectives.covariance import covariance
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.engine import Numerics
 from sysid_btr.terms.base import Parameter

@@ -281,7 +281,7 @@ def test_correlated_residuals_widen_the_direction_that_they_concern() -> None:
 
 
 def test_where_the_model_is_linear_the_posterior_has_the_sandwich_covariance() -> None:
-    from sysid_btr.identify.intervals import covariance
+    from sysid_btr.objectives.covariance import covariance
 
     toy, label = correlated(np.random.default_rng(2))
     residual, jacobian = linearise(toy, toy.optimum)

@@ -24,8 +24,8 @@ from sysid_btr.diagnosis.split import later_split
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.floating_base.fusion import weigh_walks
 from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift
+from sysid_btr.identify.fusion import weigh_walks
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.refit import (
     Fitted,

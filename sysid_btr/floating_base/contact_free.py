@@ -21,7 +21,7 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.floating_base.estimate import NEAR, foot_loads, imu_columns, lowest_points, vertical
 from sysid_btr.floating_base.feet import touching_bodies
 from sysid_btr.floating_base.walk import Walk, starts_at
-from sysid_btr.identify.intervals import Known, covariance
+from sysid_btr.objectives.covariance import Known, covariance
 from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
 from sysid_btr.simulation.engine import Numerics, compile_model, make_index, write_model

@@ -13,9 +13,9 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError
 from sysid_btr.floating_base.estimate import BaseState, estimate_base
 from sysid_btr.floating_base.feet import base_body, touching_bodies
-from sysid_btr.identify.intervals import covariance, spread
 from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot, servo_joints
+from sysid_btr.objectives.covariance import covariance, spread
 from sysid_btr.objectives.marginal import Marginal, projections, sensitivity
 from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import Episode, ReplayProblem

@@ -15,22 +15,21 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Te
 from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.floating_base.fusion import weigh_walks
 from sysid_btr.floating_base.walk import Walk
 from sysid_btr.identify.deferred import deferred_fit
-from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, RANK, Estimate, Known, estimates, newton
+from sysid_btr.identify.fusion import weigh_walks
+from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, Profile, estimates
 from sysid_btr.identify.numerics import held_numerics
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study, nominal_start
+from sysid_btr.objectives.covariance import RANK, Known, newton
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
 from sysid_btr.terms.base import Term
 
 if TYPE_CHECKING:
     from numpy.random import Generator
-
-    from sysid_btr.identify.profile import Profile
 
 SHIFT_TOLERATED = 0.3
 """Shift of an estimate under half the step, in standard errors, beyond which the step is halved."""

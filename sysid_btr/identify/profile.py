@@ -9,7 +9,7 @@ exactly as the standard errors do: it is scaled so that a parabola gives the int
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -20,8 +20,9 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.intervals import RANK, spread
+from sysid_btr.identify.intervals import Profile
 from sysid_btr.identify.refit import walking
+from sysid_btr.objectives.covariance import RANK, spread
 from sysid_btr.objectives.problem import Conditional
 
 if TYPE_CHECKING:
@@ -34,37 +35,6 @@ BEYOND = 1.3
 _MOST = 3
 """Times the points of a side that are spent before it is called open."""
 _ITERATIONS = 6
-
-
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """The likelihood along one parameter.
-
-    Attributes
-    ----------
-    name, unit : of the parameter.
-    values : (n,) at which it was held, rising.
-    deviance : (n,) twice the log-likelihood lost against the best fit, correlated residuals counted.
-    others : (n, p) all parameters at each.
-    best : value of the best fit.
-    std : standard error there, by which a parabola would rise.
-    threshold : deviance at the ends of the interval.
-    interval : where the deviance crosses it; a bound where it does not, and then `closed` says so.
-    closed : whether the lower and the upper end are crossings.
-    replays : candidates simulated.
-    """
-
-    name: str
-    unit: str
-    values: FloatArray
-    deviance: FloatArray
-    others: FloatArray
-    best: float
-    std: float
-    threshold: float
-    interval: tuple[float, float]
-    closed: tuple[bool, bool]
-    replays: int
 
 
 def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = silent) -> Profile:

@@ -23,7 +23,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.estimators.base import Problem, UnitBox
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.identify.intervals import scatter
+from sysid_btr.objectives.covariance import scatter
 
 RANK = 1e-9
 """Directions of `H` below this fraction of the largest are not seen by any residual."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.identify.profile import Profile
+    from sysid_btr.identify.intervals import Profile
     from sysid_btr.posterior.draw import Posterior
 
     Draw = Callable[[], Figure]

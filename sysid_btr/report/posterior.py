@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from sysid_btr.identify.profile import Profile
+    from sysid_btr.identify.intervals import Profile
     from sysid_btr.posterior.draw import Posterior
     from sysid_btr.posterior.predictive import Band
 

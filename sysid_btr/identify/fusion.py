@@ -11,8 +11,8 @@ from sysid_btr.estimators.lsq import linearise
 from sysid_btr.floating_base.contact_free import without_ground
 from sysid_btr.floating_base.walk import GROUND, GROUND_MASS, Walk, of_legs, repeated_error, walked_residuals
 from sysid_btr.identify.deferred import corrected
-from sysid_btr.identify.intervals import RANK, Known, covariance, newton
 from sysid_btr.identify.study import Study
+from sysid_btr.objectives.covariance import RANK, Known, covariance, newton
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.base import Term
 
