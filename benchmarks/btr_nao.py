@@ -44,7 +44,7 @@ from sysid_btr.estimators import Budget, CmaEs, Estimator, Journal, silent
 from sysid_btr.identify.replay import set_parameters
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import servo_joints
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.coulomb_friction import CoulombFriction
 from sysid_btr.terms.effect import Effect

@@ -40,7 +40,8 @@ from sysid_btr.objectives.distance import Distance, DistanceProblem, MeanSquare,
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.result import to_json
-from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 

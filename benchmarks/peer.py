@@ -27,7 +27,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 
 PARAMETERS = {"arm": ("mass:*", "kp:*=shared", "kv:*=shared"), "masses": MASSES, "kp": ("kp:*",)}
 JOINTS = 6

@@ -30,7 +30,8 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
-from sysid_btr.simulation.engine import CHUNK, Numerics, Replay
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import CHUNK, Replay
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent

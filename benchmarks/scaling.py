@@ -27,7 +27,7 @@ from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot, joint_names, robot_from_spec, servo_joints
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.library import select_effects
 
 NUMERICS = Numerics("implicitfast", 0.005)

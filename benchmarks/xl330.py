@@ -86,7 +86,7 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
     from sysid_btr.models.xl330 import xl330
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
 
     began = perf_counter()
     logs = [read_log(path) for path in sorted(folder.glob("*.parquet"))]

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log
     from sysid_btr.models.robot import Robot
     from sysid_btr.posterior.draw import Posterior
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
     from sysid_btr.terms.base import Term
 
     Job = Callable[[Study, ProgressLine], Fit | Closing | Posterior]

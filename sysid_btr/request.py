@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
     from sysid_btr.io.log import Log
     from sysid_btr.models.robot import Robot
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
     from sysid_btr.terms.base import Parameter, Term
 
 DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")

@@ -20,7 +20,8 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
-from sysid_btr.simulation.engine import Numerics, compile_model, make_index
+from sysid_btr.simulation.compiling import compile_model, make_index
+from sysid_btr.simulation.numerics import Numerics
 
 INNER = slice(10, -10)
 

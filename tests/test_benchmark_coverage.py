@@ -94,7 +94,7 @@ def test_a_draw_is_the_same_log_again_and_another_number_another(robot: str) -> 
 
 @pytest.mark.usefixtures("short")
 def test_the_replays_own_log_has_the_same_motion_and_white_noise_of_equal_size() -> None:
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
 
     case = draw(BENCHES["leg"], 9)
     assert case.spec.sensors.bits == 0

@@ -37,7 +37,8 @@ from sysid_btr.models.ant import SegmentLength
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.btr import draw_btr
 from sysid_btr.result import to_json
-from sysid_btr.simulation.engine import Replay, make_index
+from sysid_btr.simulation.compiling import make_index
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Rig, Term
 from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.effect import Effect

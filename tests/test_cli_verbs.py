@@ -23,7 +23,7 @@ from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.result import read_result
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 
 MASS, KP, FRICTION = 1.2, 0.9, 0.1
 PENDULUM = """

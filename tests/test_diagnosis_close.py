@@ -23,7 +23,7 @@ from sysid_btr.identify.study import make_study, nominal_start
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.armature import Armature
 from sysid_btr.terms.backlash import Backlash
 from sysid_btr.terms.com_offset import ComOffset

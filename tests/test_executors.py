@@ -40,7 +40,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.objectives.distance import DistanceProblem, MeanSquare, Phi1, Phi2, Wasserstein
 from sysid_btr.objectives.marginal import Projection
 from sysid_btr.objectives.problem import ReplayProblem, of_both
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.library import select_effects
 
 FREE = ("mass:*", "kp:*=shared", "kv:*=shared")

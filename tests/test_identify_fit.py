@@ -26,7 +26,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.covariance import covariance
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Parameter
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"

@@ -19,7 +19,8 @@ from sysid_btr.models.emps import emps
 from sysid_btr.models.nao import FEET, STARRED, nao, nao_table1
 from sysid_btr.models.robot import Robot, joint_names, joint_ranges, servo_joints
 from sysid_btr.models.xl330 import TORQUE_PER_VOLT, xl330
-from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.grammar import parse_parameters
 
 TABLE1 = """

@@ -28,7 +28,7 @@ from sysid_btr.objectives.distance import (
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
-from sysid_btr.simulation.engine import Replay
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.grammar import parse_parameters
 
 LABELS = st.lists(st.integers(0, 4), min_size=30, max_size=30)

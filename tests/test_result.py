@@ -21,7 +21,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.text import console, show
 from sysid_btr.result import clean, exit_code, make_result, read_result, to_json
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.units import si, si_all, with_digits_of
 
 PROMISED = {

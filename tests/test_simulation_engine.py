@@ -30,10 +30,11 @@ from toys import (
 from sysid_btr.errors import ModelError
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
-from sysid_btr.simulation import engine
-from sysid_btr.simulation.batching import chunks_together, parties
-from sysid_btr.simulation.engine import Numerics, Replay
-from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps
+from sysid_btr.simulation import replay as replay_module
+from sysid_btr.simulation.batching import batched_chunks, group_replays
+from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps, step_inputs
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.start import initial_state
 from sysid_btr.terms.coulomb_friction import CoulombFriction
 from sysid_btr.terms.grammar import parse_parameters
@@ -187,9 +188,9 @@ def test_chunks_and_threads_give_the_same_bits(law: bool, monkeypatch: pytest.Mo
         rows = np.column_stack([rows, np.full(70, 0.1), np.full(70, 0.4)])
     wanted = run(leg(), LEG_LOG, terms, rows, threads=1, effort=True)
     for chunk, threads in ((32, 2), (7, 1), (70, 0)):
-        monkeypatch.setattr(engine, "CHUNK", chunk)
-        monkeypatch.setattr(engine, "CHUNK_DOFS", 0)
-        monkeypatch.setattr(engine, "SEGMENT", 11 * chunk)
+        monkeypatch.setattr(replay_module, "CHUNK", chunk)
+        monkeypatch.setattr(replay_module, "CHUNK_DOFS", 0)
+        monkeypatch.setattr(replay_module, "SEGMENT", 11 * chunk)
         seen = run(leg(), LEG_LOG, terms, rows, threads=threads, effort=True)
         np.testing.assert_array_equal(seen.position, wanted.position)
         np.testing.assert_array_equal(seen.velocity, wanted.velocity)
@@ -231,7 +232,7 @@ def test_memory_does_not_grow_with_the_number_of_candidates() -> None:
         tracemalloc.stop()
         return used
 
-    chunk = engine.CHUNK_DOFS // len(LEG_JOINTS)
+    chunk = replay_module.CHUNK_DOFS // len(LEG_JOINTS)
     peak(chunk)
     few, many = peak(chunk), peak(8 * chunk)
     assert many < 1.5 * few + 1e6
@@ -402,7 +403,7 @@ def test_measured_inputs_are_held_over_gaps(case: tuple[np.ndarray, np.ndarray, 
     time, values, step = case
     grid = make_grid(make_log(time, {"command.arm": values}), ARM, ZERO, step)
     gaps = np.where(np.arange(len(values)) % 3 == 1, np.nan, values)
-    inputs = engine.step_inputs(make_log(time, {"voltage.arm": gaps, "duty.arm": gaps}), grid)
+    inputs = step_inputs(make_log(time, {"voltage.arm": gaps, "duty.arm": gaps}), grid)
     assert set(inputs) == {"voltage.arm"}
     assert np.isfinite(inputs["voltage.arm"]).all()
     assert len(inputs["voltage.arm"]) == grid.steps
@@ -414,7 +415,7 @@ def test_measured_inputs_are_held_over_gaps(case: tuple[np.ndarray, np.ndarray, 
 def test_an_input_without_any_value_is_left_out() -> None:
     log = held(0.0, 0.1)
     empty = replace(log, channels={**log.channels, "voltage.arm": np.full(len(log), np.nan)})
-    assert engine.step_inputs(empty, make_grid(empty, ARM, ZERO, 0.005)) == {}
+    assert step_inputs(empty, make_grid(empty, ARM, ZERO, 0.005)) == {}
 
 
 @pytest.mark.parametrize("law", [False, True])
@@ -470,13 +471,13 @@ def test_logs_simulated_together_move_as_each_does_alone(law: bool) -> None:
         Replay(r, log, terms, Numerics("RK4", 0.0025), effort=True)
         for r, log in zip(robots, logs, strict=True)
     ]
-    found = parties(replays)
+    found = group_replays(replays)
     assert sorted(i for party in found for i in party) == [0, 1, 2, 3]
     assert max(len(party) for party in found) == 3, "the short one is not dragged along"
     candidates = np.tile([p.nominal for p in replays[0].parameters], (5, 1))
     candidates += rng.uniform(0, 0.02, candidates.shape)
     for party in found:
-        for rows, together in chunks_together([replays[i] for i in party], candidates):
+        for rows, together in batched_chunks([replays[i] for i in party], candidates):
             for i, outputs in zip(party, together, strict=True):
                 alone = replays[i].predict(candidates[rows])
                 for name in ("position", "velocity", "effort"):
@@ -492,12 +493,12 @@ def test_logs_of_robots_of_another_structure_are_simulated_apart() -> None:
     )
     slow, fast = Numerics("RK4", 0.005), Numerics("RK4", 0.0025)
     replays = [Replay(r, log, (), n) for r, n in ((pendulum(), slow), (other, slow), (pendulum(), fast))]
-    assert parties(replays) == [(0,), (1,), (2,)]
+    assert group_replays(replays) == [(0,), (1,), (2,)]
 
 
 def test_a_candidate_that_diverges_in_one_log_does_not_spoil_the_others() -> None:
     wild = make_log(np.arange(101) * 0.01, {"command.arm": np.full(101, 1e9)})
     replays = [Replay(pendulum(), log, (), Numerics("RK4", 0.005)) for log in (swing(seconds=1.0), wild)]
-    ((_, (calm, thrown)),) = chunks_together(replays, np.zeros((1, 0)))
+    ((_, (calm, thrown)),) = batched_chunks(replays, np.zeros((1, 0)))
     assert np.isnan(thrown.position).all()
     assert np.isfinite(calm.position).all()

@@ -9,7 +9,7 @@ from toys import FINE, LEG_JOINTS, SCALE, leg, make_log, position, robot_from_xm
 from sysid_btr.errors import UsageError
 from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.joint_compliance import JointCompliance
 from sysid_btr.terms.library import EFFECTS, effect_names, select_effects

@@ -33,7 +33,7 @@ from toys import (
 )
 
 from sysid_btr.models.robot import Robot
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.armature import Armature
 from sysid_btr.terms.back_emf import BackEmf
 from sysid_btr.terms.backlash import Backlash, BacklashMotor

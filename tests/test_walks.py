@@ -39,7 +39,7 @@ from sysid_btr.models.gait import Gait, gait
 from sysid_btr.objectives.marginal import Marginal, projections
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.targets import Target
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows, on_slope
 from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.constant_force import ConstantForce

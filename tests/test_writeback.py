@@ -31,7 +31,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
 from sysid_btr.report.changes import change_lines, model_lines
 from sysid_btr.run_folder import Folder
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.backlash import Backlash
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.command_delay import CommandDelay

@@ -11,7 +11,8 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.robot import Robot, robot_from_spec
-from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.scales import JointScale
 

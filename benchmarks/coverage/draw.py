@@ -15,7 +15,7 @@ from reference_simulator import MOTIONS, Recording, Sensors, record
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
 
 HERE = Path(__file__).parent
 SAMPLE_LOGS = HERE.parents[1] / "sample_logs"

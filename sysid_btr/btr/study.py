@@ -20,7 +20,7 @@ from sysid_btr.identify.study import Study, measure_scales
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.problem import Episode
 from sysid_btr.objectives.targets import make_targets
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.scales import Scales
 

@@ -14,8 +14,11 @@ from sysid_btr.btr.task import Walk
 from sysid_btr.errors import ModelError
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.robot import Robot
-from sysid_btr.simulation.engine import CHUNK, Numerics, Replay, make_index, set_out, write_model
-from sysid_btr.simulation.silence import quiet
+from sysid_btr.simulation.compiling import make_index
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import CHUNK, Replay
+from sysid_btr.simulation.setup import set_out, write_model
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Index, Outputs, Rig, Term
 
 if TYPE_CHECKING:
@@ -66,7 +69,7 @@ class World(Replay):
         for first in range(0, len(commands), CHUNK):
             rows = slice(first, min(first + CHUNK, len(commands)))
             good: BoolArray = np.asarray(np.isfinite(commands[rows]).all(axis=(1, 2)))
-            with quiet():
+            with silenced():
                 outputs = self._walk(np.where(good[:, None, None], commands[rows], 0.0), values[rows])
             for array in (outputs.position, outputs.velocity, outputs.base):
                 if array is not None:

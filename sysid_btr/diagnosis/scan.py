@@ -1,7 +1,7 @@
 """Score scan: what every effect at every place would do to the residual, by simulation.
 
 Each effect is simulated at a few working points; its response, projected off what the declared parameters
-can do, is compared with the residual. Limbs that move independently are scanned in one simulation.
+can do, is compared with the residual. Subtrees that move independently are scanned in one simulation.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.subtrees import EVERYWHERE
+from sysid_btr.simulation.subtrees import WHOLE_ROBOT
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect, Probe, middle_scale, scale_at
 from sysid_btr.terms.scales import Scales
@@ -148,13 +148,13 @@ def _orthonormal(jacobian: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > 1e-6 * s[0]])
 
 
-def _limb(question: Question, where: dict[str, int]) -> int:
-    found = {where.get(place, EVERYWHERE) for place in question.places}
-    return found.pop() if len(found) == 1 else EVERYWHERE
+def _subtree(question: Question, where: dict[str, int]) -> int:
+    found = {where.get(place, WHOLE_ROBOT) for place in question.places}
+    return found.pop() if len(found) == 1 else WHOLE_ROBOT
 
 
 def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Question]]:
-    """Structural questions that can share one compiled model: one place a limb."""
+    """Structural questions that can share one compiled model: one place a subtree."""
     where = problem.where
     result: list[list[Question]] = []
     for effect in dict.fromkeys(q.effect for q in asked):
@@ -165,9 +165,9 @@ def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Qu
             used: set[int] = set()
             here = []
             for place in list(waiting):
-                limb = where[place]
-                if limb not in used:
-                    used.add(limb)
+                subtree = where[place]
+                if subtree not in used:
+                    used.add(subtree)
                     here.append(place)
                     waiting.remove(place)
             result.append([q for q in own if q.place in here])
@@ -196,12 +196,12 @@ def _ask(
         extra.append(term)
     wide = problem.with_terms((*problem.terms, *extra), values)
     neutral = np.concatenate([values, *(m.neutral for m in extra if isinstance(m, Effect))])
-    # one simulation carries one direction of one question in each limb
+    # one simulation carries one direction of one question in each subtree
     lanes: dict[int, list[tuple[int, int]]] = {}
     for i, question in enumerate(asked):
         for d in range(len(question.probe)):
-            lanes.setdefault(_limb(question, where), []).append((i, d))
-    alone = lanes.pop(EVERYWHERE, [])
+            lanes.setdefault(_subtree(question, where), []).append((i, d))
+    alone = lanes.pop(WHOLE_ROBOT, [])
     depth = max((len(lane) for lane in lanes.values()), default=0)
     jobs = [[lane[k] for lane in lanes.values() if k < len(lane)] for k in range(depth)]
     jobs += [[item] for item in alone]
@@ -212,9 +212,9 @@ def _ask(
             for place in question.places:
                 at = offset[question.effect, place]
                 candidates[row, at : at + len(question.effect.kinds)] = question.probe[d]
-    limb_of_row = wide._limbs[1]
+    subtree_of_row = wide._subtrees[1]
     responses: dict[tuple[int, int], FloatArray | None] = {}
-    rows_of = {limb: np.flatnonzero(limb_of_row == limb) for limb in lanes}
+    rows_of = {subtree: np.flatnonzero(subtree_of_row == subtree) for subtree in lanes}
     everywhere = np.arange(len(rest))
     asks = [[], *jobs]  # the first candidate asks nothing: the others are compared with it
     for first in range(0, len(candidates), BLOCK):
@@ -223,11 +223,11 @@ def _ask(
             base = block[0].copy()
         for change, job in zip(block - base, asks[first : first + BLOCK], strict=True):
             for i, d in job:
-                rows = rows_of.get(_limb(asked[i], where), everywhere)
+                rows = rows_of.get(_subtree(asked[i], where), everywhere)
                 finite = np.isfinite(change).all()
                 responses[i, d] = change[rows] if finite else None
     least = NO_RESPONSE * float(rest @ rest) / len(rest)
-    parts = {limb: _Part(rows, basis[rows], rest[rows]) for limb, rows in rows_of.items()}
+    parts = {subtree: _Part(rows, basis[rows], rest[rows]) for subtree, rows in rows_of.items()}
     whole = _Part(everywhere, basis, rest)
     traces = []
     for i, question in enumerate(asked):
@@ -235,7 +235,7 @@ def _ask(
         known = [c for c in columns if c is not None]
         if len(known) < len(columns):
             continue
-        part = parts.get(_limb(question, where), whole)
+        part = parts.get(_subtree(question, where), whole)
         trace = _judge(question, part, np.column_stack(known), least, scales)
         if trace is not None:
             traces.append(trace)
@@ -244,7 +244,7 @@ def _ask(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """The residuals of a limb, or all: their rows (n,), the basis there (n, k), and what is to be explained (n,)."""
+    """The residuals of a subtree, or all: their rows (n,), the basis there (n, k), and what is to be explained (n,)."""
 
     rows: IntArray
     basis: FloatArray
@@ -258,7 +258,7 @@ def _judge(
     coefficients = part.basis.T @ response
     projected = response - part.basis @ coefficients
     gram = response.T @ response - coefficients.T @ coefficients
-    # the residual is off the basis, so that what the projection takes, here and from other limbs, has no part in this
+    # the residual is off the basis, so what the projection takes, here and from other subtrees, has no part in this
     inner = response.T @ part.rest
     if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= least:
         return None

@@ -1,9 +1,9 @@
 """The torque that is missing: from what a replay leaves of the measured positions to torques at the joints.
 
-A small torque pulse at each joint, simulated, gives the impulse responses of a limb; Wiener deconvolution
+A small torque pulse at each joint, simulated, gives the impulse responses of a subtree; Wiener deconvolution
 with them turns position errors into the disturbance torques that would explain them (Wiener 1949,
-"Extrapolation, Interpolation, and Smoothing of Stationary Time Series"). Joints of one limb push each other,
-so a limb is inverted as a whole.
+"Extrapolation, Interpolation, and Smoothing of Stationary Time Series"). Joints of one subtree push each other,
+so a subtree is inverted as a whole.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target
-from sysid_btr.simulation.subtrees import limbs
+from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.effect import scale_at
 from sysid_btr.terms.external_disturbance import ExternalDisturbanceTrain
 from sysid_btr.terms.scales import Scales
@@ -144,7 +144,7 @@ def _deconvolve(
     log = episode.replay.log
     clock = _Clock.over(log.time)
     joints = target.joints
-    where = limbs(episode.replay.model)
+    where = subtrees(episode.replay.model)
     members: dict[int, list[int]] = {}
     for k, joint in enumerate(joints):
         members.setdefault(where[joint], []).append(k)
@@ -170,7 +170,7 @@ def _deconvolve(
     if not np.isfinite(predicted).all() or outputs.effort is None:
         return []
     error = clock.uniform(target.measured - predicted[0])
-    # response of every joint to every joint of its limb, per unit torque over one sample
+    # response of every joint to every joint of its subtree, per unit torque over one sample
     moved = [clock.uniform(p - predicted[0]) for p in predicted[1:]]
     torque = np.empty_like(error)
     noise = np.empty(len(joints))

@@ -35,7 +35,8 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
-from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.grammar import parse_parameters
 

@@ -101,7 +101,7 @@ def simulate(
 
 def _settle(worker: Any, wanted: Mapping[str, str]) -> Shelf:
     """First piece on this worker."""
-    from sysid_btr.simulation.silence import hush
+    from sysid_btr.simulation.silence import silence
 
     own = versions()
     differ = [f"{name} {own[name]} instead of {v}" for name, v in wanted.items() if own[name] != v]
@@ -110,6 +110,6 @@ def _settle(worker: Any, wanted: Mapping[str, str]) -> Shelf:
             f"worker {worker.address} has {', '.join(differ)}: its numbers would not be the same. Install the same "
             "versions on all machines"
         )
-    hush()
+    silence()
     shelf: Shelf = vars(worker).setdefault(HOME, Shelf())
     return shelf

@@ -24,10 +24,12 @@ from sysid_btr.floating_base.walk import Walk, starts_at
 from sysid_btr.objectives.covariance import Known, covariance
 from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
-from sysid_btr.simulation.engine import Numerics, compile_model, make_index, write_model
+from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid, make_grid
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
-from sysid_btr.simulation.silence import quiet
+from sysid_btr.simulation.setup import write_model
+from sysid_btr.simulation.silence import silenced
 
 if TYPE_CHECKING:
     import mujoco
@@ -117,7 +119,7 @@ class SampleSteps(WindowReplay):
         """States at the ends of steps: of candidate `row`, in step `window`, from a start with a `change`."""
         size, j = len(row), len(self.index.joints)
         base, q, dq = np.empty((size, 13)), np.empty((size, j)), np.empty((size, j))
-        with quiet():
+        with silenced():
             for sims, part in self._simulate(candidates, row, window, change):
                 assert part.base is not None
                 base[sims], q[sims], dq[sims] = part.base[:, -1], part.position[:, -1], part.velocity[:, -1]

@@ -20,9 +20,11 @@ from sysid_btr.objectives.marginal import Marginal, projections, sensitivity
 from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
-from sysid_btr.simulation.engine import Numerics, Replay, compile_model, make_index
+from sysid_btr.simulation.compiling import compile_model, make_index
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
-from sysid_btr.simulation.silence import quiet
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 
@@ -287,7 +289,7 @@ def choose_window(robot: Robot, walk: Walk, numerics: Numerics, threads: int = 0
         )
         episode = Episode(replay, targets, respond(replay, values))
         stencil = np.vstack([values, values + np.diag(step)])
-        with quiet():
+        with silenced():
             white = np.concatenate([episode.whitened(o) for _, o in replay.chunks(stencil)])
         if not np.isfinite(white).all():
             continue
@@ -521,7 +523,7 @@ def respond(replay: WindowReplay, values: FloatArray) -> Marginal:
             directions[:, k, coordinate] = windows.std[:, coordinate]
     responses: list[dict[str, FloatArray]] = [{} for _ in range(w)]
     channels = ("position", "velocity", *(("effort",) if replay.effort else ()))
-    with quiet():
+    with silenced():
         for i, outputs in replay.respond(values, directions):
             for channel in channels:
                 array: FloatArray = getattr(outputs, channel)

@@ -17,7 +17,7 @@ from sysid_btr.estimators.base import Budget, FitResult, Progress, Termination
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 
 if TYPE_CHECKING:
     from numpy.random import Generator

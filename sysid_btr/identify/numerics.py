@@ -10,7 +10,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.noise import noise_floor
-from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log

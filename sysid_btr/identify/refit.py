@@ -16,7 +16,7 @@ from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.study import WIDE_STEP, Study
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.problem import ReplayProblem, of_both
-from sysid_btr.simulation.engine import Numerics
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Term
 
 CORRELATED = 1.5

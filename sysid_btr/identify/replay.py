@@ -11,7 +11,8 @@ import numpy as np
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.split import split_episodes
-from sysid_btr.simulation.engine import Numerics, Replay
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 

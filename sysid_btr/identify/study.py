@@ -30,7 +30,9 @@ from sysid_btr.io.split import holdout_split, split_episodes
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, Target, make_targets
-from sysid_btr.simulation.engine import Numerics, Replay, make_index
+from sysid_btr.simulation.compiling import make_index
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.scales import JointScale, Scales

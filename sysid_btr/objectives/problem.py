@@ -14,9 +14,10 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.objectives.marginal import Marginal, Projection, projections
 from sysid_btr.objectives.targets import Target
-from sysid_btr.simulation.batching import chunks_together, parties
-from sysid_btr.simulation.engine import Numerics, Replay
-from sysid_btr.simulation.subtrees import colour, limbs, parameter_limbs
+from sysid_btr.simulation.batching import batched_chunks, group_replays
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
+from sysid_btr.simulation.subtrees import column_groups, parameter_subtrees, subtrees
 from sysid_btr.terms.base import Outputs, Parameter, Term
 
 
@@ -186,15 +187,15 @@ class ReplayProblem:
         return {}
 
     @cached_property
-    def _parties(self) -> list[tuple[int, ...]]:
+    def _groups(self) -> list[tuple[int, ...]]:
         """Episodes that are simulated together."""
-        return parties([e.replay for e in self.episodes])
+        return group_replays([e.replay for e in self.episodes])
 
     def _simulated(self, candidates: FloatArray) -> Iterator[tuple[int, slice, Outputs]]:
         """Episode, rows of the candidates, and what its sensors show."""
-        for party in self._parties:
-            for rows, together in chunks_together([self.episodes[i].replay for i in party], candidates):
-                for i, outputs in zip(party, together, strict=True):
+        for group in self._groups:
+            for rows, together in batched_chunks([self.episodes[i].replay for i in group], candidates):
+                for i, outputs in zip(group, together, strict=True):
                     yield i, rows, outputs
 
     @cached_property
@@ -239,33 +240,31 @@ class ReplayProblem:
 
     @cached_property
     def where(self) -> dict[str, int]:
-        """Limb of every joint and body by name; one limb where a free base joins them in any of the logs."""
+        """Subtree of every joint and body by name; one where a free base joins them in any of the logs."""
         free = (e.replay for e in self.episodes if e.replay.log.meta.mount == "free")
-        return limbs(next(free, self.episodes[0].replay).model)
+        return subtrees(next(free, self.episodes[0].replay).model)
 
     @cached_property
-    def _limbs(self) -> tuple[list[frozenset[int]], IntArray]:
-        """Limbs each parameter acts on, and the limb of each residual."""
+    def _subtrees(self) -> tuple[list[frozenset[int]], IntArray]:
+        """Subtrees each parameter acts on, and the subtree of each residual."""
         where = self.where
         of_column = np.array([where[target.joints[k]] for _, target, k in self.columns])
-        return parameter_limbs(self.terms, where), of_column[self.column_labels]
+        return parameter_subtrees(self.terms, where), of_column[self.column_labels]
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Parameters that can be varied in one simulation, because they move different limbs."""
-        return colour(self._limbs[0])
+        """Parameters that can be varied in one simulation, because they move different subtrees."""
+        return column_groups(self._subtrees[0])
 
     def support(self, parameter: int) -> BoolArray | None:
         """(r,) residuals that a parameter can move; None for all."""
-        acts_on, limb = self._limbs
+        acts_on, subtree = self._subtrees
         own = acts_on[parameter]
-        return np.isin(limb, list(own)) if own else None
+        return np.isin(subtree, list(own)) if own else None
 
     def with_terms(self, terms: Sequence[Term], start: FloatArray) -> ReplayProblem:
         """The same data under another set of terms."""
-        episodes = tuple(
-            replace(e, replay=replace(e.replay, terms=tuple(terms))) for e in self.episodes
-        )
+        episodes = tuple(replace(e, replay=replace(e.replay, terms=tuple(terms))) for e in self.episodes)
         return ReplayProblem(episodes, start, self.executor)
 
     def with_numerics(self, numerics: Numerics) -> ReplayProblem:

@@ -119,7 +119,7 @@ def scene_of(outcome: Fit | Closing) -> Scene:
     Joints that the log does not show stand as the final model has them; a free base stands where the model has
     it.
     """
-    from sysid_btr.simulation.engine import compile_model, make_index
+    from sysid_btr.simulation.compiling import compile_model, make_index
     from sysid_btr.writeback.write import identified
 
     final = identified(outcome)

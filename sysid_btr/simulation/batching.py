@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.simulation.engine import CHUNK, CHUNK_DOFS, Replay, set_out, write_model
 from sysid_btr.simulation.grid import Grid
-from sysid_btr.simulation.silence import quiet
+from sysid_btr.simulation.replay import CHUNK, CHUNK_DOFS, Replay
+from sysid_btr.simulation.setup import set_out, write_model
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Outputs, Rig
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ ALIKE = 0.6
 """Length of a log, as a fraction of the longest, from which it is worth simulating to the longest one's end."""
 
 
-def parties(replays: Sequence[Replay]) -> list[tuple[int, ...]]:
+def group_replays(replays: Sequence[Replay]) -> list[tuple[int, ...]]:
     """Positions of the replays that can be simulated together, longest first in each party."""
     order = sorted(range(len(replays)), key=lambda i: -replays[i].grid.steps)
     found: list[list[int]] = []
@@ -39,14 +40,14 @@ def parties(replays: Sequence[Replay]) -> list[tuple[int, ...]]:
     return sorted(tuple(party) for party in found)
 
 
-def chunks_together(
+def batched_chunks(
     replays: Sequence[Replay], candidates: FloatArray
 ) -> Iterator[tuple[slice, tuple[Outputs, ...]]]:
     """Predicted sensors of all replays of a party, a chunk of candidates at a time.
 
     Parameters
     ----------
-    replays : that `parties` says can be simulated together.
+    replays : that `group_replays` says can be simulated together.
     candidates : (m, parameters).
 
     Yields
@@ -62,7 +63,7 @@ def chunks_together(
     size = max(max(CHUNK, CHUNK_DOFS // max(replays[0].model.nv, 1)) // len(replays), 1)
     for first in range(0, len(candidates), size):
         rows = slice(first, min(first + size, len(candidates)))
-        with quiet():
+        with silenced():
             outputs = _run(replays, candidates[rows])
         yield rows, outputs
 

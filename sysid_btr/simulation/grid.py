@@ -137,3 +137,19 @@ def mean_over_steps(time: FloatArray, held: FloatArray, timestep: float, steps: 
     for k in range(held.shape[1]):
         result[:, k] = held[0, k] + np.diff(np.interp(borders, knots, integral[:, k])) / timestep
     return result
+
+
+def step_inputs(log: Log, grid: Grid) -> dict[str, FloatArray]:
+    """Measured drive inputs a law may use, (steps,) each: means of supply voltage and enabled flags.
+
+    A missing value leaves the one before it in force; a column without any value is left out.
+    """
+    inputs: dict[str, FloatArray] = {}
+    for name, values in log.channels.items():
+        known = np.flatnonzero(np.isfinite(values))
+        if name.split(".")[0] not in ("voltage", "enabled") or len(known) == 0:
+            continue
+        last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
+        held = np.asarray(values, dtype=np.float64)[known[last], None]
+        inputs[name] = mean_over_steps(grid.sample_time, held, grid.timestep, grid.steps)[:, 0]
+    return inputs

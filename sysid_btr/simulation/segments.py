@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.simulation.engine import Replay, write_model
 from sysid_btr.simulation.grid import Grid
+from sysid_btr.simulation.replay import Replay
+from sysid_btr.simulation.setup import write_model
 from sysid_btr.terms.base import Outputs, Rig, Term
 
 if TYPE_CHECKING:

@@ -42,8 +42,8 @@ def _library() -> ctypes.CDLL | None:
     return None
 
 
-def hush() -> None:
-    """Keep MuJoCo silent for good, in a process that does nothing else: threads would undo each other's `quiet`."""
+def silence() -> None:
+    """Keep MuJoCo silent for good, in a process that does nothing else: threads would undo each other's `silenced`."""
     library = _library()
     if library is not None:
         now = library.mju_getLogConfig()
@@ -51,7 +51,7 @@ def hush() -> None:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def silenced() -> Iterator[None]:
     """Run MuJoCo without its console and file messages; the settings are restored after."""
     library = _library()
     if library is None:

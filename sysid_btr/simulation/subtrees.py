@@ -1,6 +1,6 @@
-"""Which joints can feel each other: limbs that hang on a held torso move independently.
+"""Which joints can feel each other: subtrees that hang on a fixed torso move independently.
 
-Independent limbs let one simulation carry the finite difference of one parameter in each of them, which
+Independent subtrees let one simulation carry the finite difference of one parameter in each of them, which
 is exact, not an approximation (Curtis, Powell, Reid 1974, doi:10.1093/imamat/13.1.117).
 """
 
@@ -16,12 +16,12 @@ from sysid_btr.terms.base import Term
 if TYPE_CHECKING:
     import mujoco
 
-EVERYWHERE = -1
-"""Limb of something that acts on the whole robot."""
+WHOLE_ROBOT = -1
+"""Subtree of something that acts on the whole robot."""
 
 
-def limbs(model: mujoco.MjModel) -> dict[str, int]:
-    """Limb of every joint and body by name; names shared by a joint and its body agree."""
+def subtrees(model: mujoco.MjModel) -> dict[str, int]:
+    """Subtree of every joint and body by name; names shared by a joint and its body agree."""
     tree = np.arange(max(model.ntree, 1))
 
     def root(t: int) -> int:
@@ -46,14 +46,14 @@ def limbs(model: mujoco.MjModel) -> dict[str, int]:
     result = {}
     for b in range(model.nbody):
         t = int(model.body_treeid[b])
-        result[model.body(b).name] = root(t) if t >= 0 else EVERYWHERE
+        result[model.body(b).name] = root(t) if t >= 0 else WHOLE_ROBOT
     for j in range(model.njnt):
         result[model.joint(j).name] = root(int(model.dof_treeid[model.jnt_dofadr[j]]))
     return result
 
 
 def _may_touch(model: mujoco.MjModel) -> bool:
-    """Whether geoms of two limbs can collide with each other."""
+    """Whether geoms of two subtrees can collide with each other."""
     moving = np.flatnonzero(model.body_treeid[model.geom_bodyid] >= 0)
     for i, a in enumerate(moving):
         for b in moving[i + 1 :]:
@@ -66,18 +66,18 @@ def _may_touch(model: mujoco.MjModel) -> bool:
     return False
 
 
-def parameter_limbs(terms: Sequence[Term], where: dict[str, int]) -> list[frozenset[int]]:
-    """Limbs that each parameter of some terms acts on; empty for the whole robot."""
+def parameter_subtrees(terms: Sequence[Term], where: dict[str, int]) -> list[frozenset[int]]:
+    """Subtrees that each parameter of some terms acts on; empty for the whole robot."""
     result: list[frozenset[int]] = []
     for term in terms:
         for group in term.grouped:
-            found = frozenset(where.get(name, EVERYWHERE) for name in group)
-            result += [frozenset() if EVERYWHERE in found else found] * len(term.kinds)
+            found = frozenset(where.get(name, WHOLE_ROBOT) for name in group)
+            result += [frozenset() if WHOLE_ROBOT in found else found] * len(term.kinds)
     return result
 
 
-def colour(acts_on: Sequence[frozenset[int]]) -> tuple[tuple[int, ...], ...]:
-    """Groups of parameters that act on different limbs, greedily few."""
+def column_groups(acts_on: Sequence[frozenset[int]]) -> tuple[tuple[int, ...], ...]:
+    """Groups of parameters that act on different subtrees, greedily few."""
     groups: list[list[int]] = []
     taken: list[set[int]] = []
     for i, own in enumerate(acts_on):

@@ -12,9 +12,9 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.engine import LIFT
+from sysid_btr.simulation.compiling import LIFT
 from sysid_btr.simulation.segments import LEAD, WindowReplay
-from sysid_btr.simulation.silence import quiet
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Rig, Term
 from sysid_btr.writeback.rewrite import unequal
 
@@ -92,7 +92,7 @@ def load_model(path: Path, *, held: bool) -> mujoco.MjModel:
     """
     import mujoco
 
-    with quiet(), warnings.catch_warnings(action="ignore"):
+    with silenced(), warnings.catch_warnings(action="ignore"):
         if not held:
             return mujoco.MjModel.from_xml_path(str(path))
         spec = mujoco.MjSpec.from_file(str(path))

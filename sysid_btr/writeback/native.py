@@ -19,7 +19,7 @@ from sysid_btr.terms.payload import Payload
 if TYPE_CHECKING:
     import mujoco
 
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
 
 Held = Literal["yes", "approximately", "no"]
 SOFT = 1e-10

@@ -18,7 +18,7 @@ from sysid_btr.terms.base import Parameter, Term
 
 if TYPE_CHECKING:
     from sysid_btr.models.robot import Robot
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
 
 PARAMS_SCHEMA = "sysid_btr.params/1"
 
@@ -52,7 +52,7 @@ def read_params(path: Path, robot: Robot) -> Params:
     UsageError
         If it cannot be read, or names what this robot or this version does not have; all of it at once.
     """
-    from sysid_btr.simulation.engine import Numerics
+    from sysid_btr.simulation.numerics import Numerics
 
     file = path / PARAMS if path.is_dir() else path
     try:

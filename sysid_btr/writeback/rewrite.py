@@ -103,7 +103,7 @@ def compile_text(text: bytes) -> Compiled:
     """
     import mujoco
 
-    from sysid_btr.simulation.silence import quiet
+    from sysid_btr.simulation.silence import silenced
 
     root = parse(text)
     named: dict[Kind, dict[str, Element]] = {k: {} for k in ("body", "joint", "geom", "actuator", "tendon")}
@@ -119,7 +119,7 @@ def compile_text(text: bytes) -> Compiled:
         named[kind][name] = element
     try:
         # what the compiler warns of was said when the robot was loaded
-        with quiet(), warnings.catch_warnings(action="ignore"):
+        with silenced(), warnings.catch_warnings(action="ignore"):
             spec = mujoco.MjSpec.from_string(apply(text, edits).decode())
             model = spec.compile()
     except ValueError as error:

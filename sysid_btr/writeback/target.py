@@ -10,8 +10,9 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.models.robot import Robot
-from sysid_btr.simulation.engine import Numerics, compile_model, make_index
-from sysid_btr.simulation.silence import quiet
+from sysid_btr.simulation.compiling import compile_model, make_index
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Rig, Term
 from sysid_btr.writeback.features import WRITTEN
 from sysid_btr.writeback.native import Part, part_of
@@ -82,7 +83,7 @@ def make_target(robot: Robot, log: Log, parts: Sequence[Part], numerics: Numeric
         model = compile_model(robot, free, writing, numerics)
     for name in before:
         _put(model, name, np.asarray(rig.batch.expanded(name)[0]))
-    with quiet():
+    with silenced():
         mujoco.mj_setConst(model, mujoco.MjData(model))
     held = tuple(_as_written(part, own) for part, own in zip(parts, fields, strict=True))
     return Target(model, held, tuple(fields))

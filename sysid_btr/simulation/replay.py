@@ -15,12 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.errors import ModelError
 from sysid_btr.models.robot import Robot
-from sysid_btr.simulation.grid import Grid, at_samples, make_grid, mean_over_steps
-from sysid_btr.simulation.silence import quiet
+from sysid_btr.simulation.compiling import compile_model, made_elsewhere, make_index
+from sysid_btr.simulation.grid import Grid, at_samples, make_grid, step_inputs
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.servo import servo_torque
+from sysid_btr.simulation.setup import set_out, write_model
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.simulation.start import initial_state
-from sysid_btr.terms.base import LINK_SUFFIX, Index, Outputs, Parameter, Rig, Step, Term
+from sysid_btr.terms.base import Index, Outputs, Parameter, Rig, Step, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -33,33 +36,6 @@ CHUNK_DOFS = 704
 """Degrees of freedom simulated together, at least: small models share a step among more candidates."""
 SEGMENT = 1024
 """Steps per rollout call; bounds the records that are held at once."""
-LIFT = 1.0
-"""m, by which a robot that is held is lifted from where its model stands."""
-
-
-@dataclass(frozen=True)
-class Numerics:
-    """How the equations are integrated: MuJoCo's integrator by name, and the step in s.
-
-    With `servo_period` (s, a multiple of the step) the servos compute their torque once a period and hold it;
-    without, they act as MuJoCo's own do, at every evaluation of the dynamics.
-    """
-
-    integrator: str
-    timestep: float
-    servo_period: float | None = None
-
-    def halved(self) -> Numerics:
-        return Numerics(self.integrator, self.timestep / 2, self.servo_period)
-
-    @property
-    def held_steps(self) -> int:
-        """Steps for which a servo's torque is held; 0 where it is not."""
-        return max(round(self.servo_period / self.timestep), 1) if self.servo_period else 0
-
-    def __str__(self) -> str:
-        held = f", servo torque held for {1e3 * self.servo_period:g} ms" if self.servo_period else ""
-        return f"{self.integrator} {1e3 * self.timestep:g} ms{held}"
 
 
 @dataclass(frozen=True)
@@ -151,7 +127,7 @@ class Replay:
         size = max(CHUNK, CHUNK_DOFS // max(self.model.nv, 1))
         for first in range(0, len(candidates), size):
             rows = slice(first, min(first + size, len(candidates)))
-            with quiet():
+            with silenced():
                 outputs = self._run(candidates[rows])
             yield rows, outputs
 
@@ -516,155 +492,12 @@ class _Drive:
         self.forcerange[:, self.actuators] = np.where(finite[..., None], force, 0.0)
 
 
-def write_model(rig: Rig, pairs: Sequence[tuple[Term, FloatArray]]) -> None:
-    """Write the model fields of every candidate, and what MuJoCo derives from them."""
-    for term, values in pairs:
-        term.write_fields(rig, values)
-    if rig.touched & set(_setconst_inputs()):
-        rig.batch.set_const()
-
-
-def set_out(
-    rig: Rig,
-    pairs: Sequence[tuple[Term, FloatArray]],
-    qpos: FloatArray,
-    qvel: FloatArray,
-    command: FloatArray,
-    steps: int,
-) -> tuple[FloatArray, FloatArray | None]:
-    """Put the batch where its replay begins: commands as they reach the servos, and torques known in advance.
-
-    `qpos` and `qvel` are (m, joints), `command` is (m, steps, joints); terms may change all of them.
-    """
-    applied: FloatArray | None = None
-    border_time = rig.timestep * np.arange(steps + 1, dtype=np.float64)
-    for term, values in pairs:
-        term.initial_state(rig, values, qpos, qvel)
-        command = term.shape_command(rig, values, command)
-        torque = term.applied_torque(rig, values, border_time)
-        if torque is not None:
-            applied = torque if applied is None else applied + torque
-    rig.batch.bind("qpos")[:, rig.index.qpos] = qpos
-    rig.batch.bind("qvel")[:, rig.index.dof] = qvel
-    return command, applied
-
-
-def servo_torque(
-    rig: Rig, command: FloatArray, qpos: FloatArray, qvel: FloatArray, rows: slice = slice(None)
-) -> FloatArray:
-    """Joint torque of the servos by their own law, (m, samples, joints), of some rows; zero without a servo.
-
-    Computed here because MuJoCo's `actuator_force` lags the state by a substep.
-    """
-    index, model = rig.index, rig.model
-    torque = np.zeros(np.broadcast_shapes(command.shape, qpos.shape))
-    for j, a in enumerate(index.actuator):
-        if a < 0:
-            continue
-
-        def values(name: str, a: int = int(a)) -> Any:
-            expanded = rig.batch.expanded(name)
-            array = getattr(model, name)[None] if expanded is None else expanded[rows]
-            return array[:, a]
-
-        gain, bias = values("actuator_gainprm"), values("actuator_biasprm")
-        gear = values("actuator_gear")[:, :1]
-        force = (
-            gain[:, :1] * command[:, :, j]
-            + bias[:, :1]
-            + bias[:, 1:2] * gear * qpos[:, :, j]
-            + bias[:, 2:3] * gear * qvel[:, :, j]
-        )
-        limited = values("actuator_forcelimited").astype(bool)[:, None]
-        limits = values("actuator_forcerange")
-        clipped = np.clip(force, limits[:, :1], np.maximum(limits[:, 1:2], limits[:, :1]))
-        torque[:, :, j] = gear * np.where(limited, clipped, force)
-    return torque
-
-
-def made_elsewhere() -> mujoco.MjSpec:
-    """In the place of a model's source, where only the compiled model was sent."""
-    raise ModelError("this model was compiled in another process, and cannot be compiled anew here")
-
-
-def compile_model(
-    robot: Robot, log: Log, terms: Sequence[Term], numerics: Numerics
-) -> mujoco.MjModel:
-    """Compile the robot for a log: mount, integrator, step, friction numerics, added structure."""
-    import mujoco
-
-    spec = robot.make_spec()
-    spec.option.timestep = numerics.timestep
-    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{numerics.integrator.upper()}")
-    if log.meta.mount == "fixed":
-        for joint in list(spec.joints):
-            if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-                # a robot that is held hangs clear of the ground it would otherwise stand on
-                joint.parent.pos = np.add(joint.parent.pos, (0.0, 0.0, LIFT))
-                spec.delete(joint)
-    else:
-        # the pyramid that MuJoCo has for a cone by default slides easier along one direction than another
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    # friction as stiff as the step allows: the default creeps and blurs reversals
-    constant = max(2 * numerics.timestep, 0.002)
-    for joint in spec.joints:
-        joint.solref_friction = [constant, 1.0]
-        joint.solimp_friction = [0.99, 0.999, 0.001, 0.5, 2.0]
-    for term in terms:
-        term.edit_spec(spec)
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise ModelError(f"model {robot.name}: MuJoCo cannot compile it: {error}") from error
-
-
-def make_index(model: mujoco.MjModel) -> Index:
-    """Addresses of every hinge and slide joint of the model."""
-    import mujoco
-
-    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    ids = {model.joint(i).name: i for i in range(model.njnt) if int(model.jnt_type[i]) in single}
-    joints = tuple(name for name in ids if not name.endswith(LINK_SUFFIX))
-    actuator_of = {
-        int(model.actuator_trnid[a, 0]): a
-        for a in range(model.nu)
-        if model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
-    }
-    own = np.array([ids[j] for j in joints], dtype=np.int64)
-    link = np.array([ids.get(j + LINK_SUFFIX, -1) for j in joints], dtype=np.int64)
-    return Index(
-        joints=joints,
-        qpos=model.jnt_qposadr[own].astype(np.int64),
-        dof=model.jnt_dofadr[own].astype(np.int64),
-        actuator=np.array([actuator_of.get(int(i), -1) for i in own], dtype=np.int64),
-        body=model.jnt_bodyid[own].astype(np.int64),
-        link_qpos=np.where(link >= 0, model.jnt_qposadr[link], -1).astype(np.int64),
-        link_dof=np.where(link >= 0, model.jnt_dofadr[link], -1).astype(np.int64),
-    )
-
-
 def law_index(index: Index, term: Term) -> IntArray:
     """Positions of a modifier's places among the joints; every joint for the whole robot."""
     known = set(index.joints)
     if all(place in known for place in term.places):
         return index.of(term.places)
     return np.arange(len(index.joints))
-
-
-def step_inputs(log: Log, grid: Grid) -> dict[str, FloatArray]:
-    """Measured drive inputs a law may use, (steps,) each: means of supply voltage and enabled flags.
-
-    A missing value leaves the one before it in force; a column without any value is left out.
-    """
-    inputs: dict[str, FloatArray] = {}
-    for name, values in log.channels.items():
-        known = np.flatnonzero(np.isfinite(values))
-        if name.split(".")[0] not in ("voltage", "enabled") or len(known) == 0:
-            continue
-        last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
-        held = np.asarray(values, dtype=np.float64)[known[last], None]
-        inputs[name] = mean_over_steps(grid.sample_time, held, grid.timestep, grid.steps)[:, 0]
-    return inputs
 
 
 def inputs_of(logs: Sequence[tuple[Log, Grid]], steps: int, rows: int) -> dict[str, FloatArray]:
@@ -674,9 +507,3 @@ def inputs_of(logs: Sequence[tuple[Log, Grid]], steps: int, rows: int) -> dict[s
     return {
         name: np.repeat(np.stack([inputs[name] for inputs in own], axis=1), share, axis=1) for name in own[0]
     }
-
-
-def _setconst_inputs() -> Sequence[str]:
-    import mujoco
-
-    return tuple(mujoco.MjModel._setconst_inputs)

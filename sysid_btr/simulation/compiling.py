@@ -1,0 +1,82 @@
+"""From a robot to the compiled model of one log, and where the log's joints live in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr.errors import ModelError
+from sysid_btr.models.robot import Robot
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.terms.base import LINK_SUFFIX, Index, Term
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from sysid_btr.io.log import Log
+
+LIFT = 1.0
+"""m, by which a robot that is held is lifted from where its model stands."""
+
+
+def made_elsewhere() -> mujoco.MjSpec:
+    """In the place of a model's source, where only the compiled model was sent."""
+    raise ModelError("this model was compiled in another process, and cannot be compiled anew here")
+
+
+def compile_model(
+    robot: Robot, log: Log, terms: Sequence[Term], numerics: Numerics
+) -> mujoco.MjModel:
+    """Compile the robot for a log: mount, integrator, step, friction numerics, added structure."""
+    import mujoco
+
+    spec = robot.make_spec()
+    spec.option.timestep = numerics.timestep
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{numerics.integrator.upper()}")
+    if log.meta.mount == "fixed":
+        for joint in list(spec.joints):
+            if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+                # a robot that is held hangs clear of the ground it would otherwise stand on
+                joint.parent.pos = np.add(joint.parent.pos, (0.0, 0.0, LIFT))
+                spec.delete(joint)
+    else:
+        # the pyramid that MuJoCo has for a cone by default slides easier along one direction than another
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    # friction as stiff as the step allows: the default creeps and blurs reversals
+    constant = max(2 * numerics.timestep, 0.002)
+    for joint in spec.joints:
+        joint.solref_friction = [constant, 1.0]
+        joint.solimp_friction = [0.99, 0.999, 0.001, 0.5, 2.0]
+    for term in terms:
+        term.edit_spec(spec)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ModelError(f"model {robot.name}: MuJoCo cannot compile it: {error}") from error
+
+
+def make_index(model: mujoco.MjModel) -> Index:
+    """Addresses of every hinge and slide joint of the model."""
+    import mujoco
+
+    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    ids = {model.joint(i).name: i for i in range(model.njnt) if int(model.jnt_type[i]) in single}
+    joints = tuple(name for name in ids if not name.endswith(LINK_SUFFIX))
+    actuator_of = {
+        int(model.actuator_trnid[a, 0]): a
+        for a in range(model.nu)
+        if model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    }
+    own = np.array([ids[j] for j in joints], dtype=np.int64)
+    link = np.array([ids.get(j + LINK_SUFFIX, -1) for j in joints], dtype=np.int64)
+    return Index(
+        joints=joints,
+        qpos=model.jnt_qposadr[own].astype(np.int64),
+        dof=model.jnt_dofadr[own].astype(np.int64),
+        actuator=np.array([actuator_of.get(int(i), -1) for i in own], dtype=np.int64),
+        body=model.jnt_bodyid[own].astype(np.int64),
+        link_qpos=np.where(link >= 0, model.jnt_qposadr[link], -1).astype(np.int64),
+        link_dof=np.where(link >= 0, model.jnt_dofadr[link], -1).astype(np.int64),
+    )
