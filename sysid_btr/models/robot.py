@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sysid_btr.errors import ModelError
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.base import Scope, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -54,6 +54,11 @@ class Robot:
     def for_log(self, log: Log) -> Robot:
         """The robot as this log's metadata describes it (servo registers, supply, load)."""
         return self if self.configure is None else self.configure(self, log)
+
+    def names(self, scope: Scope) -> tuple[str, ...]:
+        """Names that a term of this scope can have as its places, in model order."""
+        listing = {"body": body_names, "joint": joint_names, "servo": servo_joints}
+        return listing[scope](self) if scope in listing else (scope,)
 
     def compile(self) -> mujoco.MjModel:
         """The plain model."""

@@ -7,10 +7,9 @@ import fnmatch
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from sysid_btr.errors import UsageError
-from sysid_btr.models.robot import Robot, body_names, joint_names, servo_joints
 from sysid_btr.terms.base import Parameter, Scope
 from sysid_btr.terms.fields import FIELDS, FieldTerm, nominal_value
 from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales
@@ -18,11 +17,25 @@ from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales
 if TYPE_CHECKING:
     import mujoco
 
-SCOPES: dict[Scope, Callable[[Robot], tuple[str, ...]]] = {
-    "body": body_names,
-    "joint": joint_names,
-    "servo": servo_joints,
-}
+
+class Robot(Protocol):
+    """What the grammar asks of a robot; `models.robot.Robot` answers."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def bounds(self) -> Mapping[str, tuple[float, float]]: ...
+
+    @property
+    def tied(self) -> tuple[tuple[str, ...], ...]: ...
+
+    @property
+    def fields(self) -> Mapping[str, type[FieldTerm]]: ...
+
+    def compile(self) -> mujoco.MjModel: ...
+
+    def names(self, scope: Scope) -> tuple[str, ...]: ...
 
 
 def parse_parameters(
@@ -69,7 +82,7 @@ def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[Fie
     if equals and option != "shared":
         raise UsageError(f"after '=' only 'shared' is allowed, not {option!r}")
     cls = fields[field]
-    known = SCOPES[cls.scope](robot)
+    known = robot.names(cls.scope)
     names: list[str] = []
     for glob in globs.split(","):
         matched = [n for n in known if fnmatch.fnmatchcase(n, glob)]

@@ -7,14 +7,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.run_folder import PARAMS
-from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.terms.base import Parameter, Scope, Term
 
 if TYPE_CHECKING:
     from sysid_btr.models.robot import Robot
@@ -67,7 +67,7 @@ def read_params(path: Path, robot: Robot) -> Params:
     terms: list[Term] = []
     values: list[float] = []
     try:
-        places = _places(robot)
+        places = {scope: robot.names(scope) for scope in get_args(Scope)}
         for entry in content["modifiers"]:
             term = _modifier(entry, places, problems, robot)
             if term is not None:
@@ -81,17 +81,6 @@ def read_params(path: Path, robot: Robot) -> Params:
     if problems:
         raise UsageError(f"--params {file}:\n" + "\n".join(f"  {p}" for p in problems))
     return Params(tuple(terms), np.array(values), numerics)
-
-
-def _places(robot: Robot) -> Mapping[str, Sequence[str]]:
-    from sysid_btr.models.robot import body_names, joint_names, servo_joints
-
-    return {
-        "body": body_names(robot),
-        "joint": joint_names(robot),
-        "servo": servo_joints(robot),
-        "robot": ("robot",),
-    }
 
 
 def _modifier(
