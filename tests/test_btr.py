@@ -39,7 +39,7 @@ from sysid_btr.report.btr import draw_btr
 from sysid_btr.result import to_json
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.terms.base import Rig, Term
+from sysid_btr.terms.base import BatchModel, Term
 from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.grammar import parse_parameters
@@ -137,7 +137,8 @@ def test_a_length_written_into_fields_is_the_model_that_a_compiler_makes(monkeyp
     term.edit_spec(spec)
     model = spec.compile()
     batch = Batch(model, 1, 1)
-    term.write_fields(Rig(model, batch, make_index(model), 0.005), np.array([[[1.3], [0.8]]]))
+    models = BatchModel(model, batch, make_index(model), 0.005)
+    models.write(term.model_fields(models, np.array([[[1.3], [0.8]]])))
     batch.set_const()
     written = batch.get_model(0)
     femur, tibia, add_leg = ant_module.FEMUR, ant_module.TIBIA, ant_module._add_leg

@@ -19,7 +19,7 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import CHUNK, Replay
 from sysid_btr.simulation.setup import set_out, write_model
 from sysid_btr.simulation.silence import silenced
-from sysid_btr.terms.base import Index, Outputs, Rig, Term
+from sysid_btr.terms.base import BatchModel, JointAddresses, Outputs, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -37,7 +37,7 @@ class World(Replay):
     """
 
     @cached_property
-    def index(self) -> Index:
+    def index(self) -> JointAddresses:
         model = self.model
         free = np.flatnonzero(model.jnt_type == 0)
         if len(free) != 1:
@@ -90,8 +90,8 @@ class World(Replay):
         batch.bind("qpos")[:, index.base[0] + 2] -= lowest(self.model, batch)
         return self._go(rig, pairs, held, applied, grid)
 
-    def _rig(self, batch: Batch, pairs: list[tuple[Term, FloatArray]]) -> Rig:
-        rig = Rig(self.model, batch, self.index, self.numerics.timestep)
+    def _rig(self, batch: Batch, pairs: list[tuple[Term, FloatArray]]) -> BatchModel:
+        rig = BatchModel(self.model, batch, self.index, self.numerics.timestep)
         write_model(rig, pairs)
         return rig
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import mujoco
     from mujoco.batch import Batch
 
-    from sysid_btr.terms.base import Index, Rig
+    from sysid_btr.terms.base import BatchModel, JointAddresses
 
 ROUNDS = 6
 """Gauss-Newton steps at most; the first moves states alone."""
@@ -94,7 +94,7 @@ class SampleSteps(WindowReplay):
         return model
 
     @cached_property
-    def index(self) -> Index:
+    def index(self) -> JointAddresses:
         return replace(make_index(self.model), base=self._free_joint)
 
     @cached_property
@@ -286,13 +286,13 @@ def _nominal(replay: WindowReplay) -> FloatArray:
     return np.array([p.nominal for p in replay.parameters])
 
 
-def _written(replay: WindowReplay, values: FloatArray) -> Rig:
+def _written(replay: WindowReplay, values: FloatArray) -> BatchModel:
     """A rig with a candidate's numbers in its fields."""
     from mujoco.batch import Batch
 
-    from sysid_btr.terms.base import Rig
+    from sysid_btr.terms.base import BatchModel
 
-    rig = Rig(replay.model, Batch(replay.model, 1, 1), replay.index, replay.grid.timestep)
+    rig = BatchModel(replay.model, Batch(replay.model, 1, 1), replay.index, replay.grid.timestep)
     write_model(rig, replay._values(values[None]))
     return rig
 

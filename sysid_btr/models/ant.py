@@ -17,7 +17,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.models.robot import Robot, robot_from_spec
-from sysid_btr.terms.base import Kind, Rig, Scope
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope
 from sysid_btr.terms.fields import FieldTerm, allow_any_inertia
 
 if TYPE_CHECKING:
@@ -57,11 +57,11 @@ class SegmentLength(FieldTerm):
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         allow_any_inertia(spec, self.places)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        model = rig.model
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        model = batch.model
         names = ("geom_pos", "geom_size", "geom_rbound", "geom_aabb", "body_pos", "site_pos")
-        geom_pos, geom_size, rbound, aabb, body_pos, site_pos = (rig.array(name) for name in names)
-        mass, inertia, ipos = (rig.array(name) for name in ("body_mass", "body_inertia", "body_ipos"))
+        fields = {name: batch.read(name) for name in (*names, "body_mass", "body_inertia", "body_ipos")}
+        geom_pos, geom_size, rbound, aabb, body_pos, site_pos, mass, inertia, ipos = fields.values()
         for place, name in enumerate(self.places):
             body = model.body(name).id
             geom = _capsule(model, body)
@@ -81,6 +81,7 @@ class SegmentLength(FieldTerm):
             mass[:, body] *= after[0] / before[0]
             inertia[:, body] *= np.stack([after[1], after[1], after[2]], axis=-1) / [before[1], before[1], before[2]]
             ipos[:, body] *= factor[:, None]
+        return fields
 
 
 def _capsule(model: mujoco.MjModel, body: int) -> int:

@@ -16,7 +16,7 @@ from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.replay import CHUNK, CHUNK_DOFS, Replay
 from sysid_btr.simulation.setup import set_out, write_model
 from sysid_btr.simulation.silence import silenced
-from sysid_btr.terms.base import Outputs, Rig
+from sysid_btr.terms.base import BatchModel, Outputs
 
 if TYPE_CHECKING:
     import mujoco
@@ -74,7 +74,7 @@ def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ..
     lead, m = replays[0], len(candidates)
     logs = len(replays)
     batch = Batch(lead.model, m * logs, lead.threads)
-    rig = Rig(lead.model, batch, lead.index, lead.numerics.timestep)
+    rig = BatchModel(lead.model, batch, lead.index, lead.numerics.timestep)
     shares = [slice(i * m, (i + 1) * m) for i in range(logs)]
     for name in sorted({n for r in replays[1:] for n in _different(lead.model, r.model) or ()}):
         array = rig.array(name)

@@ -10,7 +10,7 @@ import numpy as np
 from sysid_btr.errors import ModelError
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.base import LINK_SUFFIX, Index, Term
+from sysid_btr.terms.base import LINK_SUFFIX, JointAddresses, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -57,7 +57,7 @@ def compile_model(
         raise ModelError(f"model {robot.name}: MuJoCo cannot compile it: {error}") from error
 
 
-def make_index(model: mujoco.MjModel) -> Index:
+def make_index(model: mujoco.MjModel) -> JointAddresses:
     """Addresses of every hinge and slide joint of the model."""
     import mujoco
 
@@ -71,7 +71,7 @@ def make_index(model: mujoco.MjModel) -> Index:
     }
     own = np.array([ids[j] for j in joints], dtype=np.int64)
     link = np.array([ids.get(j + LINK_SUFFIX, -1) for j in joints], dtype=np.int64)
-    return Index(
+    return JointAddresses(
         joints=joints,
         qpos=model.jnt_qposadr[own].astype(np.int64),
         dof=model.jnt_dofadr[own].astype(np.int64),

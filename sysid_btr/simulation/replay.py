@@ -23,7 +23,7 @@ from sysid_btr.simulation.servo import servo_torque
 from sysid_btr.simulation.setup import set_out, write_model
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.simulation.start import initial_state
-from sysid_btr.terms.base import Index, Outputs, Parameter, Rig, Step, Term
+from sysid_btr.terms.base import BatchModel, JointAddresses, Outputs, Parameter, Step, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -81,7 +81,7 @@ class Replay:
         return compile_model(self.robot, self.log, self.all_terms, self.numerics)
 
     @cached_property
-    def index(self) -> Index:
+    def index(self) -> JointAddresses:
         return make_index(self.model)
 
     @cached_property
@@ -145,7 +145,7 @@ class Replay:
         m = len(candidates)
         pairs = self._values(candidates)
         batch = Batch(self.model, m, self.threads)
-        rig = Rig(self.model, batch, self.index, self.numerics.timestep)
+        rig = BatchModel(self.model, batch, self.index, self.numerics.timestep)
         write_model(rig, pairs)
         qpos = np.tile(self.start[0], (m, 1))
         qvel = np.tile(self.start[1], (m, 1))
@@ -155,7 +155,7 @@ class Replay:
 
     def _go(
         self,
-        rig: Rig,
+        rig: BatchModel,
         pairs: list[tuple[Term, FloatArray]],
         command: FloatArray,
         applied: FloatArray | None,
@@ -167,7 +167,7 @@ class Replay:
 
     def integrate(
         self,
-        rig: Rig,
+        rig: BatchModel,
         pairs: list[tuple[Term, FloatArray]],
         command: FloatArray,
         applied: FloatArray | None,
@@ -185,7 +185,7 @@ class Replay:
 
     def read(
         self,
-        rig: Rig,
+        rig: BatchModel,
         rows: slice,
         pairs: list[tuple[Term, FloatArray]],
         states: States,
@@ -207,17 +207,17 @@ class Replay:
         outputs = Outputs(grid.sample_time, position, velocity, effort, base)
         for term, values in pairs:
             term.read_out(rig, values, outputs)
-        warned = rig.batch.warning[rows, :, 1].sum(axis=1) > 0
+        warned = rig.simulations.warning[rows, :, 1].sum(axis=1) > 0
         bad = ~np.isfinite(outputs.position).all(axis=(1, 2)) | warned
         for array in (outputs.position, outputs.velocity, outputs.effort, outputs.base):
             if array is not None:
                 array[bad] = np.nan
         return outputs
 
-    def _roll_out(self, rig: Rig, command: FloatArray, applied: FloatArray | None, grid: Grid) -> States:
+    def _roll_out(self, rig: BatchModel, command: FloatArray, applied: FloatArray | None, grid: Grid) -> States:
         import mujoco
 
-        batch, index, keep = rig.batch, self.index, grid.state
+        batch, index, keep = rig.simulations, self.index, grid.state
         states = States.empty(rig.size, len(keep), index)
         states.put(index, np.array([0]), batch.bind("qpos")[:, None], batch.bind("qvel")[:, None])
         spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
@@ -238,10 +238,10 @@ class Replay:
         return states
 
     def _hold_through(
-        self, rig: Rig, command: FloatArray, applied: FloatArray | None, grid: Grid
+        self, rig: BatchModel, command: FloatArray, applied: FloatArray | None, grid: Grid
     ) -> States:
         """From one tick of digital servos to the next: their torque is computed at the tick and held."""
-        batch, index, keep = rig.batch, self.index, grid.state
+        batch, index, keep = rig.simulations, self.index, grid.state
         drive = _Drive(rig)
         d, driven = drive.driven, drive.actuators
         qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
@@ -276,7 +276,7 @@ class Replay:
 
     def _step_through(
         self,
-        rig: Rig,
+        rig: BatchModel,
         laws: list[tuple[Term, FloatArray]],
         command: FloatArray,
         applied: FloatArray | None,
@@ -284,7 +284,7 @@ class Replay:
         inputs: dict[str, FloatArray],
     ) -> States:
         """Step by step, for laws that MuJoCo cannot hold; all candidates of the chunk at once."""
-        batch, index = rig.batch, self.index
+        batch, index = rig.simulations, self.index
         h = grid.timestep
         states = States.empty(rig.size, len(grid.state), index, effort=self.effort)
         drive = _Drive(rig)
@@ -345,7 +345,7 @@ class States:
     base: FloatArray | None = None
 
     @classmethod
-    def empty(cls, m: int, kept: int, index: Index, *, effort: bool = False) -> States:
+    def empty(cls, m: int, kept: int, index: JointAddresses, *, effort: bool = False) -> States:
         def new() -> FloatArray:
             return np.empty((m, kept, len(index.joints)))
 
@@ -373,7 +373,7 @@ class States:
         if self.effort is not None:
             self.effort[:, -1] = self.effort[:, -2]
 
-    def put(self, index: Index, slots: IntArray, qpos: FloatArray, qvel: FloatArray) -> None:
+    def put(self, index: JointAddresses, slots: IntArray, qpos: FloatArray, qvel: FloatArray) -> None:
         self.motor[:, slots] = qpos[:, :, index.qpos]
         self.motor_velocity[:, slots] = qvel[:, :, index.dof]
         if self.base is not None and index.base is not None:
@@ -388,7 +388,7 @@ class States:
             self.velocity[:, slots[:, None], linked] += qvel[:, :, index.link_dof[linked]]
 
     def store(
-        self, index: Index, slot: int, q: FloatArray, v: FloatArray, qpos: FloatArray, qvel: FloatArray
+        self, index: JointAddresses, slot: int, q: FloatArray, v: FloatArray, qpos: FloatArray, qvel: FloatArray
     ) -> None:
         """Keep one state: `q` and `v` are the joints' part of `qpos` and `qvel`."""
         if self.position is self.motor and self.base is None:
@@ -400,7 +400,7 @@ class States:
 class _Drive:
     """Per-step access to servos, friction and limits for laws; resets what it added at each step."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: BatchModel) -> None:
         index = rig.index
         self.rig = rig
         self.driven = np.flatnonzero(index.actuator >= 0)
@@ -492,7 +492,7 @@ class _Drive:
         self.forcerange[:, self.actuators] = np.where(finite[..., None], force, 0.0)
 
 
-def law_index(index: Index, term: Term) -> IntArray:
+def law_index(index: JointAddresses, term: Term) -> IntArray:
     """Positions of a modifier's places among the joints; every joint for the whole robot."""
     known = set(index.joints)
     if all(place in known for place in term.places):

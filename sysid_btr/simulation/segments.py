@@ -18,7 +18,7 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import write_model
-from sysid_btr.terms.base import Outputs, Rig, Term
+from sysid_btr.terms.base import BatchModel, Outputs, Term
 
 if TYPE_CHECKING:
     from mujoco.batch import Batch
@@ -260,7 +260,7 @@ class WindowReplay(Replay):
             starts = starts.moved(late)
         size = len(window)
         batch = Batch(self.model, size, self.threads)
-        rig = Rig(self.model, batch, self.index, h)
+        rig = BatchModel(self.model, batch, self.index, h)
         write_model(rig, pairs)
         if "opt.gravity" in rig.touched:
             starts = on_slope(starts, np.array(self.model.opt.gravity), np.array(rig.array("opt.gravity")))

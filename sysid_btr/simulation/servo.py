@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Rig
+from sysid_btr.terms.base import BatchModel
 
 
 def servo_torque(
-    rig: Rig, command: FloatArray, qpos: FloatArray, qvel: FloatArray, rows: slice = slice(None)
+    rig: BatchModel, command: FloatArray, qpos: FloatArray, qvel: FloatArray, rows: slice = slice(None)
 ) -> FloatArray:
     """Joint torque of the servos by their own law, (m, samples, joints), of some rows; zero without a servo.
 
@@ -24,7 +24,7 @@ def servo_torque(
             continue
 
         def values(name: str, a: int = int(a)) -> Any:
-            expanded = rig.batch.expanded(name)
+            expanded = rig.simulations.expanded(name)
             array = getattr(model, name)[None] if expanded is None else expanded[rows]
             return array[:, a]
 

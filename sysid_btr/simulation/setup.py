@@ -7,19 +7,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Rig, Term
+from sysid_btr.terms.base import BatchModel, Term
 
 
-def write_model(rig: Rig, pairs: Sequence[tuple[Term, FloatArray]]) -> None:
+def write_model(rig: BatchModel, pairs: Sequence[tuple[Term, FloatArray]]) -> None:
     """Write the model fields of every candidate, and what MuJoCo derives from them."""
     for term, values in pairs:
-        term.write_fields(rig, values)
+        rig.write(term.model_fields(rig, values))
     if rig.touched & set(_setconst_inputs()):
-        rig.batch.set_const()
+        rig.simulations.set_const()
 
 
 def set_out(
-    rig: Rig,
+    rig: BatchModel,
     pairs: Sequence[tuple[Term, FloatArray]],
     qpos: FloatArray,
     qvel: FloatArray,
@@ -38,8 +38,8 @@ def set_out(
         torque = term.applied_torque(rig, values, border_time)
         if torque is not None:
             applied = torque if applied is None else applied + torque
-    rig.batch.bind("qpos")[:, rig.index.qpos] = qpos
-    rig.batch.bind("qvel")[:, rig.index.dof] = qvel
+    rig.simulations.bind("qpos")[:, rig.index.qpos] = qpos
+    rig.simulations.bind("qvel")[:, rig.index.dof] = qvel
     return command, applied
 
 

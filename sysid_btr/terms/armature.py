@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.scales import JointScale
 
@@ -28,5 +28,7 @@ class Armature(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         return (Kind("inertia", scale.unit("kg m2"), 0.0, 0.0, 5 * scale.inertia, 0.05 * scale.inertia),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_armature")[:, rig.index.dof[rig.index.of(self.places)]] += values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        armature = batch.read("dof_armature")
+        armature[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
+        return {"dof_armature": armature}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import LINK_SUFFIX, Kind, Rig
+from sysid_btr.terms.base import LINK_SUFFIX, BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -70,7 +70,7 @@ class Backlash(Effect):
             link.limited = True
             link.range = [-HELD, HELD]
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
         """Stops as MuJoCo's soft limits: of stiffness k / R, where R = (1 - d) / d times the joint's mobility.
 
         k is the largest that the integrator bears, and the impedance d follows. What the limit adds to the inertia
@@ -78,17 +78,18 @@ class Backlash(Effect):
         """
         import mujoco
 
-        ids = np.array([rig.model.joint(name + LINK_SUFFIX).id for name in self.places])
+        ids = np.array([batch.model.joint(name + LINK_SUFFIX).id for name in self.places])
         half = np.maximum(values[:, :, 0] / 2, HELD)
-        ranges = rig.array("jnt_range")
+        ranges = batch.read("jnt_range")
         ranges[:, ids, 0], ranges[:, ids, 1] = -half, half
-        mobility = rig.model.dof_invweight0[rig.model.jnt_dofadr[ids]]
-        steps = 1.0 if rig.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 2.0
-        rate = 1 / (steps * rig.timestep) ** 2
+        mobility = batch.model.dof_invweight0[batch.model.jnt_dofadr[ids]]
+        steps = 1.0 if batch.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 2.0
+        rate = 1 / (steps * batch.timestep) ** 2
         impedance = np.minimum(1 / (1 + rate * values[:, :, 1] / mobility), RIGID)
-        solref, solimp = rig.array("jnt_solref"), rig.array("jnt_solimp")
+        solref, solimp = batch.read("jnt_solref"), batch.read("jnt_solimp")
         solref[:, ids, 0], solref[:, ids, 1] = -rate * impedance, -2 * np.sqrt(rate * impedance)
         solimp[:, ids, 0], solimp[:, ids, 1] = impedance, impedance
+        return {"jnt_range": ranges, "jnt_solref": solref, "jnt_solimp": solimp}
 
 
 @dataclass(frozen=True)

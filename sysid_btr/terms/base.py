@@ -58,7 +58,7 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Index:
+class JointAddresses:
     """Where the log's joints live in the compiled model.
 
     Attributes
@@ -84,24 +84,50 @@ class Index:
         return np.array([lookup[name] for name in names], dtype=np.int64)
 
 
+Fields = dict[str, FloatArray]
+"""Compiled model field by name -> its values under each candidate, (candidates, ...)."""
+
+
 @dataclass
-class Rig:
-    """One batch of simulations being set up: the model, its expanded fields and its index."""
+class BatchModel:
+    """The models of a batch of simulations that is being set up: one compiled model, and what candidates change in it.
+
+    Attributes
+    ----------
+    model : compiled, without what candidates change.
+    simulations : the batch, of which each simulation has one candidate's numbers.
+    index, timestep : addresses of joints, and s.
+    touched : names of the fields that are no longer the compiled model's.
+    """
 
     model: mujoco.MjModel
-    batch: Batch
-    index: Index
+    simulations: Batch
+    index: JointAddresses
     timestep: float
     touched: set[str] = field(default_factory=set)
 
+    def read(self, name: str) -> Any:
+        """A copy of a compiled field's present values (`opt.gravity` for one of the options), (candidates, ...)."""
+        present = self.simulations.expanded(name)
+        if present is not None:
+            return present.copy()
+        shared = getattr(self.model.opt, name[4:]) if name.startswith("opt.") else getattr(self.model, name)
+        return np.tile(shared, (self.size, *(1,) * np.ndim(shared)))
+
+    def write(self, fields: Fields) -> None:
+        """Let fields have these values."""
+        for name, values in fields.items():
+            self.array(name)[...] = values
+
     def array(self, name: str) -> Any:
-        """Live per-candidate values of a compiled model field, (candidates, ...)."""
+        """Live per-candidate values of a compiled field, to be written at every step."""
         self.touched.add(name)
-        return self.batch.expand(name)
+        return self.simulations.expand(name)
 
     @property
     def size(self) -> int:
-        return int(self.batch.nsim)
+        """Number of candidates."""
+        return int(self.simulations.nsim)
 
 
 @dataclass
@@ -229,28 +255,29 @@ class Term:
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         """Add structure before the model is compiled (once, never per candidate)."""
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        """Write per-candidate model fields."""
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        """Compiled fields that differ from the present ones, each whole: {name: (m, ...)}."""
+        return {}
 
-    def initial_state(self, rig: Rig, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
         """Change the starting state in place; qpos and qvel are (m, joints of the log)."""
 
-    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         """Transform the commands that reach the servos, (m, steps, joints of the log)."""
         return command
 
-    def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray | None:
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
         """Joint torque known in advance, (m, steps, joints of the log), or None."""
         return None
 
-    def start_law(self, rig: Rig, values: FloatArray) -> Any:
+    def start_law(self, batch: BatchModel, values: FloatArray) -> Any:
         """Memory of the law at the start of a replay."""
         return None
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         """Act at every step; `index` are the positions of the places among the joints of the log."""
 
-    def read_out(self, rig: Rig, values: FloatArray, outputs: Outputs) -> None:
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
         """Change what the sensors show, in place."""
 
     @classmethod

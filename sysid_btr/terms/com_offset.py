@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.fields import allow_any_inertia
 from sysid_btr.terms.scales import JointScale
@@ -37,6 +37,8 @@ class ComOffset(Effect):
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         allow_any_inertia(spec, self.places)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = [rig.model.body(name).id for name in self.places]
-        rig.array("body_ipos")[:, ids] += values
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = [batch.model.body(name).id for name in self.places]
+        centre = batch.read("body_ipos")
+        centre[:, ids] += values
+        return {"body_ipos": centre}

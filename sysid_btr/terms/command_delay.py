@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.fields import delay_command
 from sysid_btr.terms.scales import JointScale
@@ -30,5 +30,5 @@ class CommandDelay(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((0.008,),), ((0.025,),))
 
-    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
-        return delay_command(command, rig.index.of(self.places), values[:, :, 0] / rig.timestep)
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+        return delay_command(command, batch.index.of(self.places), values[:, :, 0] / batch.timestep)

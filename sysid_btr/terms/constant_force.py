@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Kind
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.scales import JointScale
 
@@ -31,7 +31,7 @@ class ConstantForce(Effect):
         peak = scale.counter_peak
         return (Kind("torque", scale.unit("Nm"), 0.0, -peak, peak, 0.1 * scale.torque_rms),)
 
-    def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray:
-        torque = np.zeros((rig.size, len(time) - 1, len(rig.index.joints)))
-        torque[:, :, rig.index.of(self.places)] = values[:, None, :, 0]
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
+        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        torque[:, :, batch.index.of(self.places)] = values[:, None, :, 0]
         return torque

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -36,5 +36,7 @@ class CoulombFriction(Effect):
         held = 0.7 * scale.measured_rms  # a joint that sticks most of the time
         return tuple(((t,),) for t in (size, 4 * size, *((held,) if held > 6 * size else ())))
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_frictionloss")[:, rig.index.dof[rig.index.of(self.places)]] += values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        friction = batch.read("dof_frictionloss")
+        friction[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
+        return {"dof_frictionloss": friction}

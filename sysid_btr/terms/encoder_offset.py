@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Outputs, Rig
+from sysid_btr.terms.base import BatchModel, Kind, Outputs
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.scales import JointScale
 
@@ -30,8 +30,8 @@ class EncoderOffset(Effect):
         reach = 0.3 if not scale.slide else 0.3 * scale.span
         return (Kind("offset", scale.unit("rad"), 0.0, -reach, reach, reach / 60),)
 
-    def read_out(self, rig: Rig, values: FloatArray, outputs: Outputs) -> None:
-        outputs.position[:, :, rig.index.of(self.places)] += values[:, None, :, 0]
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        outputs.position[:, :, batch.index.of(self.places)] += values[:, None, :, 0]
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class EncoderOffsetInLoop(EncoderOffset):
 
     variant: ClassVar[str] = "loop"
 
-    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         shaped = command.copy()
-        shaped[:, :, rig.index.of(self.places)] -= values[:, None, :, 0]
+        shaped[:, :, batch.index.of(self.places)] -= values[:, None, :, 0]
         return shaped
 
-    def initial_state(self, rig: Rig, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
-        qpos[:, rig.index.of(self.places)] -= values[:, :, 0]
+    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        qpos[:, batch.index.of(self.places)] -= values[:, :, 0]

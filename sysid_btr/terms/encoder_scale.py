@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Outputs, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Outputs
 from sysid_btr.terms.effect import Effect
 
 
@@ -24,8 +24,8 @@ class EncoderScale(Effect):
         ("joint_spring", "a logged effort"),
     )
 
-    def read_out(self, rig: Rig, values: FloatArray, outputs: Outputs) -> None:
-        columns = rig.index.of(self.places)
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        columns = batch.index.of(self.places)
         outputs.position[:, :, columns] *= 1 + values[:, None, :, 0]
         outputs.velocity[:, :, columns] *= 1 + values[:, None, :, 0]
 
@@ -36,11 +36,13 @@ class EncoderScaleInLoop(EncoderScale):
 
     variant: ClassVar[str] = "loop"
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = rig.index.actuator[rig.index.of(self.places)]
-        rig.array("actuator_biasprm")[:, ids, 1:3] *= 1 + values[:, :, :1]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = batch.index.actuator[batch.index.of(self.places)]
+        bias = batch.read("actuator_biasprm")
+        bias[:, ids, 1:3] *= 1 + values[:, :, :1]
+        return {"actuator_biasprm": bias}
 
-    def initial_state(self, rig: Rig, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
-        columns = rig.index.of(self.places)
+    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        columns = batch.index.of(self.places)
         qpos[:, columns] /= 1 + values[:, :, 0]
         qvel[:, columns] /= 1 + values[:, :, 0]

@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Parameter, Rig
+from sysid_btr.terms.base import BatchModel, Kind, Parameter
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -50,12 +50,12 @@ class ExternalDisturbance(Effect):
         """The same with times bounded near a guess (parameters,), so that a fit can refine them."""
         return replace(self, known=_near(self.parameters, values, len(self.kinds)))
 
-    def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray:
-        torque = np.zeros((rig.size, len(time) - 1, len(rig.index.joints)))
-        for place, column in enumerate(rig.index.of(self.places)):
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
+        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        for place, column in enumerate(batch.index.of(self.places)):
             amount, start, duration = (values[:, place, k, None] for k in range(3))
             overlap = np.minimum(time[None, 1:], start + duration) - np.maximum(time[None, :-1], start)
-            torque[:, :, column] += amount * np.maximum(overlap, 0.0) / rig.timestep
+            torque[:, :, column] += amount * np.maximum(overlap, 0.0) / batch.timestep
         return torque
 
 
@@ -93,9 +93,9 @@ class ExternalDisturbanceTrain(Effect):
         """The same with times bounded near a guess (parameters,), so that a fit can refine them."""
         return replace(self, known=_near(self.parameters, values, len(self.kinds)))
 
-    def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray | None:
-        torque = np.zeros((rig.size, len(time) - 1, len(rig.index.joints)))
-        for place, column in enumerate(rig.index.of(self.places)):
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
+        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        for place, column in enumerate(batch.index.of(self.places)):
             torque[:, :, column] += pulses(values[:, place], time)
         return torque
 
@@ -115,21 +115,18 @@ class DriveDisturbanceTrain(ExternalDisturbanceTrain):
         ("external_disturbance", "a logged effort: a push from outside is not in it"),
     )
 
-    def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray | None:
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
         return None
 
-    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
-        actuator = rig.index.actuator[rig.index.of(self.places)]
-        expanded = rig.batch.expanded("actuator_gainprm")
-        gains = rig.model.actuator_gainprm[None] if expanded is None else expanded
-        gears = rig.batch.expanded("actuator_gear")
-        gears = rig.model.actuator_gear[None] if gears is None else gears
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+        actuator = batch.index.actuator[batch.index.of(self.places)]
+        gains, gears = batch.read("actuator_gainprm"), batch.read("actuator_gear")
         stiffness = gains[:, actuator, 0] * gears[:, actuator, 0]
-        time = rig.timestep * np.arange(command.shape[1] + 1, dtype=np.float64)
+        time = batch.timestep * np.arange(command.shape[1] + 1, dtype=np.float64)
         shaped = np.array(command)
-        for place, column in enumerate(rig.index.of(self.places)):
+        for place, column in enumerate(batch.index.of(self.places)):
             if actuator[place] >= 0:
-                kp = np.broadcast_to(stiffness[:, place, None], (rig.size, 1))
+                kp = stiffness[:, place, None]
                 offset = np.divide(1.0, kp, out=np.zeros_like(kp), where=kp != 0)
                 shaped[:, :, column] += pulses(values[:, place], time) * offset
         return shaped

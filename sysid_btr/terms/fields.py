@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import LINK_SUFFIX, Kind, Rig, Scope, Term
+from sysid_btr.terms.base import LINK_SUFFIX, BatchModel, Fields, Kind, Scope, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -22,26 +22,26 @@ class FieldTerm(Term):
     """A parameter of the grammar; `scope` says which names its globs match."""
 
 
-def _bodies(rig: Rig, places: tuple[str, ...]) -> list[int]:
-    return [rig.model.body(name).id for name in places]
+def _bodies(batch: BatchModel, places: tuple[str, ...]) -> list[int]:
+    return [batch.model.body(name).id for name in places]
 
 
-def _dofs(rig: Rig, places: tuple[str, ...]) -> IntArray:
-    result: IntArray = rig.index.dof[rig.index.of(places)]
+def _dofs(batch: BatchModel, places: tuple[str, ...]) -> IntArray:
+    result: IntArray = batch.index.dof[batch.index.of(places)]
     return result
 
 
-def _damper(rig: Rig, name: str) -> tuple[Literal["dof", "tendon"], int]:
+def _damper(batch: BatchModel, name: str) -> tuple[Literal["dof", "tendon"], int]:
     """Where a joint's own damping sits: on both of its sides together, where an effect has split it."""
-    model = rig.model
+    model = batch.model
     for t in range(model.ntendon):
         if model.tendon(t).name == name + LINK_SUFFIX:
             return "tendon", t
     return "dof", int(model.jnt_dofadr[model.joint(name).id])
 
 
-def _servos(rig: Rig, places: tuple[str, ...]) -> IntArray:
-    result: IntArray = rig.index.actuator[rig.index.of(places)]
+def _servos(batch: BatchModel, places: tuple[str, ...]) -> IntArray:
+    result: IntArray = batch.index.actuator[batch.index.of(places)]
     return result
 
 
@@ -59,10 +59,12 @@ class Mass(FieldTerm):
     scope: ClassVar[Scope] = "body"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.3, 3.0, 0.1),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = _bodies(rig, self.places)
-        rig.array("body_mass")[:, ids] *= values[:, :, 0]
-        rig.array("body_inertia")[:, ids] *= values[:, :, :1]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = _bodies(batch, self.places)
+        mass, inertia = batch.read("body_mass"), batch.read("body_inertia")
+        mass[:, ids] *= values[:, :, 0]
+        inertia[:, ids] *= values[:, :, :1]
+        return {"body_mass": mass, "body_inertia": inertia}
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,10 @@ class Inertia(FieldTerm):
     scope: ClassVar[Scope] = "body"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.1, 10.0, 0.2),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("body_inertia")[:, _bodies(rig, self.places)] *= values[:, :, :1]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        inertia = batch.read("body_inertia")
+        inertia[:, _bodies(batch, self.places)] *= values[:, :, :1]
+        return {"body_inertia": inertia}
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,10 @@ class Com(FieldTerm):
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         allow_any_inertia(spec, self.places)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("body_ipos")[:, _bodies(rig, self.places)] += values
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        centre = batch.read("body_ipos")
+        centre[:, _bodies(batch, self.places)] += values
+        return {"body_ipos": centre}
 
 
 @dataclass(frozen=True)
@@ -100,10 +106,12 @@ class Kp(FieldTerm):
     scope: ClassVar[Scope] = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 3.0, 0.05),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = _servos(rig, self.places)
-        rig.array("actuator_gainprm")[:, ids, 0] *= values[:, :, 0]
-        rig.array("actuator_biasprm")[:, ids, 1] *= values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = _servos(batch, self.places)
+        gain, bias = batch.read("actuator_gainprm"), batch.read("actuator_biasprm")
+        gain[:, ids, 0] *= values[:, :, 0]
+        bias[:, ids, 1] *= values[:, :, 0]
+        return {"actuator_gainprm": gain, "actuator_biasprm": bias}
 
 
 @dataclass(frozen=True)
@@ -114,8 +122,10 @@ class Kv(FieldTerm):
     scope: ClassVar[Scope] = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.0, 5.0, 0.1),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("actuator_biasprm")[:, _servos(rig, self.places), 2] *= values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        bias = batch.read("actuator_biasprm")
+        bias[:, _servos(batch, self.places), 2] *= values[:, :, 0]
+        return {"actuator_biasprm": bias}
 
 
 @dataclass(frozen=True)
@@ -126,11 +136,13 @@ class TorqueConstant(FieldTerm):
     scope: ClassVar[Scope] = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 3.0, 0.05),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = _servos(rig, self.places)
-        rig.array("actuator_gainprm")[:, ids, 0] *= values[:, :, 0]
-        rig.array("actuator_biasprm")[:, ids, :3] *= values[:, :, :1]
-        rig.array("actuator_forcerange")[:, ids] *= values[:, :, :1]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = _servos(batch, self.places)
+        gain, bias, limits = (batch.read(f"actuator_{name}") for name in ("gainprm", "biasprm", "forcerange"))
+        gain[:, ids, 0] *= values[:, :, 0]
+        bias[:, ids, :3] *= values[:, :, :1]
+        limits[:, ids] *= values[:, :, :1]
+        return {"actuator_gainprm": gain, "actuator_biasprm": bias, "actuator_forcerange": limits}
 
 
 @dataclass(frozen=True)
@@ -140,10 +152,13 @@ class Damping(FieldTerm):
     name: ClassVar[str] = "damping"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", np.nan, 0.0, np.inf, np.nan),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        fields: dict[str, FloatArray] = {}
         for place, name in enumerate(self.places):
-            kind, where = _damper(rig, name)
-            rig.array(f"{kind}_damping")[:, where] = values[:, place, 0]
+            kind, where = _damper(batch, name)
+            damping = fields.setdefault(f"{kind}_damping", batch.read(f"{kind}_damping"))
+            damping[:, where] = values[:, place, 0]
+        return fields
 
 
 @dataclass(frozen=True)
@@ -153,10 +168,13 @@ class QuadraticDamping(FieldTerm):
     name: ClassVar[str] = "quadratic_damping"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s2/rad2", np.nan, 0.0, np.inf, np.nan),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        fields: dict[str, FloatArray] = {}
         for place, name in enumerate(self.places):
-            kind, where = _damper(rig, name)
-            rig.array(f"{kind}_dampingpoly")[:, where, 0] = values[:, place, 0]
+            kind, where = _damper(batch, name)
+            damping = fields.setdefault(f"{kind}_dampingpoly", batch.read(f"{kind}_dampingpoly"))
+            damping[:, where, 0] = values[:, place, 0]
+        return fields
 
 
 @dataclass(frozen=True)
@@ -166,8 +184,10 @@ class Frictionloss(FieldTerm):
     name: ClassVar[str] = "frictionloss"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", np.nan, 0.0, np.inf, np.nan),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_frictionloss")[:, _dofs(rig, self.places)] = values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        friction = batch.read("dof_frictionloss")
+        friction[:, _dofs(batch, self.places)] = values[:, :, 0]
+        return {"dof_frictionloss": friction}
 
 
 @dataclass(frozen=True)
@@ -177,8 +197,10 @@ class Armature(FieldTerm):
     name: ClassVar[str] = "armature"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("inertia", "kg m2", np.nan, 0.0, np.inf, np.nan),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_armature")[:, _dofs(rig, self.places)] = values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        armature = batch.read("dof_armature")
+        armature[:, _dofs(batch, self.places)] = values[:, :, 0]
+        return {"dof_armature": armature}
 
 
 @dataclass(frozen=True)
@@ -188,9 +210,11 @@ class Stiffness(FieldTerm):
     name: ClassVar[str] = "stiffness"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("k", "Nm/rad", np.nan, 0.0, np.inf, np.nan),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = [rig.model.joint(name).id for name in self.places]
-        rig.array("jnt_stiffness")[:, ids] = values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = [batch.model.joint(name).id for name in self.places]
+        stiffness = batch.read("jnt_stiffness")
+        stiffness[:, ids] = values[:, :, 0]
+        return {"jnt_stiffness": stiffness}
 
 
 @dataclass(frozen=True)
@@ -201,27 +225,29 @@ class ForceLimit(FieldTerm):
     scope: ClassVar[Scope] = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", np.nan, 0.0, np.inf, np.nan),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = _servos(rig, self.places)
-        bound = values[:, :, 0] / np.abs(rig.model.actuator_gear[ids, 0])
-        rig.array("actuator_forcelimited")[:, ids] = True
-        ranges = rig.array("actuator_forcerange")
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = _servos(batch, self.places)
+        bound = values[:, :, 0] / np.abs(batch.model.actuator_gear[ids, 0])
+        limited, ranges = batch.read("actuator_forcelimited"), batch.read("actuator_forcerange")
+        limited[:, ids] = True
         ranges[:, ids, 0], ranges[:, ids, 1] = -bound, bound
+        return {"actuator_forcelimited": limited, "actuator_forcerange": ranges}
 
 
-def narrow_force_limit(rig: Rig, places: tuple[str, ...], limit: FloatArray) -> None:
+def narrow_force_limit(batch: BatchModel, places: tuple[str, ...], limit: FloatArray) -> Fields:
     """Clip servo torques to +-limit too, (m, places); an infinite limit leaves the servo as it was."""
-    ids = _servos(rig, places)
-    limited, ranges = rig.array("actuator_forcelimited"), rig.array("actuator_forcerange")
+    ids = _servos(batch, places)
+    limited, ranges = batch.read("actuator_forcelimited"), batch.read("actuator_forcerange")
     finite = np.isfinite(limit)
     bound = np.where(finite, limit, 0.0)
-    gear = np.abs(rig.model.actuator_gear[ids, 0])
+    gear = np.abs(batch.model.actuator_gear[ids, 0])
     was = limited[:, ids].astype(bool)
     low = np.where(finite, -bound / gear, ranges[:, ids, 0])
     high = np.where(finite, bound / gear, ranges[:, ids, 1])
     ranges[:, ids, 0] = np.where(was & finite, np.maximum(low, ranges[:, ids, 0]), low)
     ranges[:, ids, 1] = np.where(was & finite, np.minimum(high, ranges[:, ids, 1]), high)
     limited[:, ids] = was | finite
+    return {"actuator_forcelimited": limited, "actuator_forcerange": ranges}
 
 
 @dataclass(frozen=True)
@@ -231,9 +257,9 @@ class ConstantForce(FieldTerm):
     name: ClassVar[str] = "constant_force"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, -np.inf, np.inf, np.nan),)
 
-    def applied_torque(self, rig: Rig, values: FloatArray, time: FloatArray) -> FloatArray:
-        torque = np.zeros((rig.size, len(time) - 1, len(rig.index.joints)))
-        torque[:, :, rig.index.of(self.places)] = values[:, None, :, 0]
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
+        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        torque[:, :, batch.index.of(self.places)] = values[:, None, :, 0]
         return torque
 
 
@@ -244,8 +270,8 @@ class Delay(FieldTerm):
     name: ClassVar[str] = "delay"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.2, 0.005),)
 
-    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
-        return delay_command(command, rig.index.of(self.places), values[:, :, 0] / rig.timestep)
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+        return delay_command(command, batch.index.of(self.places), values[:, :, 0] / batch.timestep)
 
 
 def delay_command(command: FloatArray, columns: IntArray, steps: FloatArray) -> FloatArray:
@@ -276,14 +302,15 @@ class FootFriction(FieldTerm):
     scope: ClassVar[Scope] = "body"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("mu", "1", np.nan, 0.05, 2.0, 0.1),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        friction = rig.array("geom_friction")
-        bodies = _bodies(rig, self.places)
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        friction = batch.read("geom_friction")
+        bodies = _bodies(batch, self.places)
         for place, body in enumerate(bodies):
-            friction[:, rig.model.geom_bodyid == body, 0] = values[:, place, :1]
+            friction[:, batch.model.geom_bodyid == body, 0] = values[:, place, :1]
         # MuJoCo takes the larger of two geoms' frictions, so the ground must not be the larger one
-        ground = rig.model.geom_bodyid == 0
+        ground = batch.model.geom_bodyid == 0
         friction[:, ground, 0] = np.minimum(friction[:, ground, 0], values[:, :, 0].min(axis=1)[:, None])
+        return {"geom_friction": friction}
 
 
 @dataclass(frozen=True)
@@ -294,14 +321,15 @@ class FootCompliance(FieldTerm):
     scope: ClassVar[Scope] = "body"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 10.0, 0.1),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        solref = rig.array("geom_solref")
-        geoms, constant = rig.model.geom_bodyid, rig.model.geom_solref[:, 0]
-        for place, body in enumerate(_bodies(rig, self.places)):
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        solref = batch.read("geom_solref")
+        geoms, constant = batch.model.geom_bodyid, batch.model.geom_solref[:, 0]
+        for place, body in enumerate(_bodies(batch, self.places)):
             solref[:, (geoms == body) & (constant > 0), 0] *= values[:, place, :1]
         # MuJoCo takes the mean of two geoms' time constants
-        ground = (rig.model.body_weldid[geoms] == 0) & (constant > 0)
+        ground = (batch.model.body_weldid[geoms] == 0) & (constant > 0)
         solref[:, ground, 0] *= values[:, :, 0].mean(axis=1)[:, None]
+        return {"geom_solref": solref}
 
 
 @dataclass(frozen=True)
@@ -311,8 +339,8 @@ class StartPosition(FieldTerm):
     name: ClassVar[str] = "qpos0"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("offset", "rad", 0.0, -0.1, 0.1, 0.002),)
 
-    def initial_state(self, rig: Rig, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
-        qpos[:, rig.index.of(self.places)] += values[:, :, 0]
+    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        qpos[:, batch.index.of(self.places)] += values[:, :, 0]
 
 
 @dataclass(frozen=True)
@@ -322,8 +350,8 @@ class StartVelocity(FieldTerm):
     name: ClassVar[str] = "qvel0"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("offset", "rad/s", 0.0, -5.0, 5.0, 0.05),)
 
-    def initial_state(self, rig: Rig, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
-        qvel[:, rig.index.of(self.places)] += values[:, :, 0]
+    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        qvel[:, batch.index.of(self.places)] += values[:, :, 0]
 
 
 FIELDS: dict[str, type[FieldTerm]] = {

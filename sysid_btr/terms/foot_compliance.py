@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -29,8 +29,9 @@ class FootCompliance(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((1.5,),), ((3.0,),))
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        touching = (rig.model.geom_contype != 0) | (rig.model.geom_conaffinity != 0)
-        solref = rig.array("geom_solref")
-        standard = touching & (rig.model.geom_solref[:, 0] > 0)
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        touching = (batch.model.geom_contype != 0) | (batch.model.geom_conaffinity != 0)
+        solref = batch.read("geom_solref")
+        standard = touching & (batch.model.geom_solref[:, 0] > 0)
         solref[:, np.flatnonzero(standard), 0] *= values[:, 0, :1]
+        return {"geom_solref": solref}

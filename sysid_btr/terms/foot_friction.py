@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -29,6 +29,8 @@ class FootFriction(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((0.8,),), ((0.5,),))
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        touching = (rig.model.geom_contype != 0) | (rig.model.geom_conaffinity != 0)
-        rig.array("geom_friction")[:, np.flatnonzero(touching), 0] *= values[:, 0, :1]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        touching = (batch.model.geom_contype != 0) | (batch.model.geom_conaffinity != 0)
+        friction = batch.read("geom_friction")
+        friction[:, np.flatnonzero(touching), 0] *= values[:, 0, :1]
+        return {"geom_friction": friction}

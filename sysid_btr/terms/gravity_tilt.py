@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -31,11 +31,12 @@ class GravityTilt(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((0.02, 0.0), (0.0, 0.02)),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        gravity = rig.array("opt.gravity")
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        gravity = batch.read("opt.gravity")
         x, y = values[:, 0, 0], values[:, 0, 1]
         gx, gy, gz = gravity[:, 0].copy(), gravity[:, 1].copy(), gravity[:, 2].copy()
         gy, gz = np.cos(x) * gy - np.sin(x) * gz, np.sin(x) * gy + np.cos(x) * gz
         gravity[:, 0] = np.cos(y) * gx + np.sin(y) * gz
         gravity[:, 1] = gy
         gravity[:, 2] = -np.sin(y) * gx + np.cos(y) * gz
+        return {"opt.gravity": gravity}

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import Kind, Rig, Step
+from sysid_btr.terms.base import BatchModel, Kind, Step
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.scales import JointScale
 
@@ -33,7 +33,7 @@ class IntegralGain(Effect):
         size = scale.torque_rms / (0.02 * max(scale.span, 1e-9))
         return (Kind("ki", scale.unit("Nm/(rad s)"), 0.0, 0.0, 10 * size, 0.1 * size),)
 
-    def start_law(self, rig: Rig, values: FloatArray) -> FloatArray:
+    def start_law(self, batch: BatchModel, values: FloatArray) -> FloatArray:
         return np.zeros(values.shape[:2])
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:

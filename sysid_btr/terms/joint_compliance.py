@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.terms.backlash import add_link_joint
-from sysid_btr.terms.base import LINK_SUFFIX, Kind, Rig
+from sysid_btr.terms.base import LINK_SUFFIX, BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -51,17 +51,18 @@ class JointCompliance(Effect):
             spec.joint(name + LINK_SUFFIX).stiffness = [1.0, 0.0, 0.0]
             spec.joint(name + LINK_SUFFIX).damping = [1.0, 0.0, 0.0]
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = np.array([rig.model.joint(name + LINK_SUFFIX).id for name in self.places])
-        dofs = rig.model.jnt_dofadr[ids]
-        mobility = rig.model.dof_invweight0[dofs]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = np.array([batch.model.joint(name + LINK_SUFFIX).id for name in self.places])
+        dofs = batch.model.jnt_dofadr[ids]
+        mobility = batch.model.dof_invweight0[dofs]
         # the stiffest spring that stays stable, with a margin of 2 (Euler) or 4 (RK4) for other poses:
         # (omega h)^2 = 2
-        stiffest = 2.0 / (mobility * rig.timestep**2)
+        stiffest = 2.0 / (mobility * batch.timestep**2)
         stiffness = 1 / np.maximum(values[:, :, 0], 1 / stiffest)
-        rig.array("jnt_stiffness")[:, ids] = stiffness
-        most = 0.5 / (mobility * rig.timestep)
-        rig.array("dof_damping")[:, dofs] = np.minimum(RELAXATION * stiffness, most)
+        most = 0.5 / (mobility * batch.timestep)
+        springs, damping = batch.read("jnt_stiffness"), batch.read("dof_damping")
+        springs[:, ids], damping[:, dofs] = stiffness, np.minimum(RELAXATION * stiffness, most)
+        return {"jnt_stiffness": springs, "dof_damping": damping}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -54,12 +54,13 @@ class JointSpring(Effect):
         values[0] *= total
         return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        ids = [rig.model.joint(name).id for name in self.places]
-        qpos = rig.model.jnt_qposadr[ids]
-        stiffness, rest = rig.array("jnt_stiffness"), rig.array("qpos_spring")
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = [batch.model.joint(name).id for name in self.places]
+        qpos = batch.model.jnt_qposadr[ids]
+        stiffness, rest = batch.read("jnt_stiffness"), batch.read("qpos_spring")
         before = stiffness[:, ids].copy()
         total = before + values[:, :, 0]
         moment = before * rest[:, qpos] + values[:, :, 0] * values[:, :, 1]
         rest[:, qpos] = np.where(total > 0, moment / np.where(total > 0, total, 1.0), rest[:, qpos])
         stiffness[:, ids] = total
+        return {"jnt_stiffness": stiffness, "qpos_spring": rest}

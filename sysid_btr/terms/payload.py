@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.fields import allow_any_inertia
 from sysid_btr.terms.scales import JointScale
@@ -75,11 +75,11 @@ class Payload(Effect):
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         allow_any_inertia(spec, self.places)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        mass, inertia = rig.array("body_mass"), rig.array("body_inertia")
-        ipos, iquat = rig.array("body_ipos"), rig.array("body_iquat")
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        mass, inertia = batch.read("body_mass"), batch.read("body_inertia")
+        ipos, iquat = batch.read("body_ipos"), batch.read("body_iquat")
         for place, name in enumerate(self.places):
-            body = rig.model.body(name).id
+            body = batch.model.body(name).id
             added, where, ball = values[:, place, 0], values[:, place, 1:4], values[:, place, 4]
             loaded = added > 0
             if not loaded.any():
@@ -97,6 +97,7 @@ class Payload(Effect):
             ipos[loaded, body] = joint[loaded]
             inertia[loaded, body] = principal[loaded]
             iquat[loaded, body] = _quaternions(axes[loaded])
+        return {"body_mass": mass, "body_inertia": inertia, "body_ipos": ipos, "body_iquat": iquat}
 
 
 def _point(mass: FloatArray, r: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.scales import JointScale
 
@@ -29,5 +29,7 @@ class QuadraticDamping(Effect):
         size = scale.damping / scale.velocity_rms
         return (Kind("b", scale.unit("Nm s2/rad2"), 0.0, 0.0, 5 * size, 0.1 * size),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_dampingpoly")[:, rig.index.dof[rig.index.of(self.places)], 0] += values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        damping = batch.read("dof_dampingpoly")
+        damping[:, batch.index.dof[batch.index.of(self.places)], 0] += values[:, :, 0]
+        return {"dof_dampingpoly": damping}

@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.interpolation import hermite
-from sysid_btr.terms.base import Kind, Outputs, Rig
+from sysid_btr.terms.base import BatchModel, Kind, Outputs
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -32,9 +32,9 @@ class SensorDelay(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((0.008,),), ((0.025,),))
 
-    def read_out(self, rig: Rig, values: FloatArray, outputs: Outputs) -> None:
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
         time = outputs.time
-        for place, column in enumerate(rig.index.of(self.places)):
+        for place, column in enumerate(batch.index.of(self.places)):
             delay = values[:, place, 0]
             if not delay.any():
                 continue

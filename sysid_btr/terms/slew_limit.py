@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -37,13 +37,13 @@ class SlewLimit(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return tuple(((f * max(scale.velocity_peak, 1e-9),),) for f in (0.9, 0.7, 0.5, 0.3))
 
-    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         shaped = np.array(command)
-        columns = rig.index.of(self.places)
+        columns = batch.index.of(self.places)
         wanted = shaped[:, :, columns]
         # at the upper bound there is no limit: a held command jumps faster than the motion it describes
         off = values[:, :, 0] >= np.array([p.upper for p in self.spread_parameters(0)])
-        most = np.where(off, np.inf, values[:, :, 0] * rig.timestep)
+        most = np.where(off, np.inf, values[:, :, 0] * batch.timestep)
         if off.all():
             return shaped
         now = wanted[:, 0].copy()

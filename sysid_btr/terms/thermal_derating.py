@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import Kind, Rig, Step
+from sysid_btr.terms.base import BatchModel, Kind, Step
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -43,7 +43,7 @@ class ThermalDerating(Effect):
         alpha = cls.sized(scale)[0].scale
         return tuple(((alpha, tau),) for tau in (5.0, 20.0))
 
-    def start_law(self, rig: Rig, values: FloatArray) -> FloatArray:
+    def start_law(self, batch: BatchModel, values: FloatArray) -> FloatArray:
         return np.zeros(values.shape[:2])
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.fields import narrow_force_limit
 from sysid_btr.terms.scales import JointScale
@@ -37,6 +37,6 @@ class TorqueLimit(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return tuple(((f * max(scale.torque_peak, 1e-9),),) for f in (0.85, 0.65, 0.45, 0.28))
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
         most = np.array([p.upper for p in self.spread_parameters(0)])
-        narrow_force_limit(rig, self.places, np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0]))
+        return narrow_force_limit(batch, self.places, np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0]))

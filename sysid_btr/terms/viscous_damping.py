@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Rig
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.scales import JointScale
 
@@ -28,5 +28,7 @@ class ViscousDamping(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         return (Kind("b", scale.unit("Nm s/rad"), 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        rig.array("dof_damping")[:, rig.index.dof[rig.index.of(self.places)]] += values[:, :, 0]
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        damping = batch.read("dof_damping")
+        damping[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
+        return {"dof_damping": damping}

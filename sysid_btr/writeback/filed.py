@@ -15,7 +15,7 @@ from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.compiling import LIFT
 from sysid_btr.simulation.segments import LEAD, WindowReplay
 from sysid_btr.simulation.silence import silenced
-from sysid_btr.terms.base import Rig, Term
+from sysid_btr.terms.base import BatchModel, Term
 from sysid_btr.writeback.rewrite import unequal
 
 if TYPE_CHECKING:
@@ -35,21 +35,21 @@ class FilledBuffers(Term):
 
     name: ClassVar[str] = "filled_buffers"
 
-    def shape_command(self, rig: Rig, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         import mujoco
 
-        model, h = rig.model, rig.timestep
-        sizes = [int(model.actuator_history[a, 0]) if a >= 0 else 0 for a in rig.index.actuator]
+        model, h = batch.model, batch.timestep
+        sizes = [int(model.actuator_history[a, 0]) if a >= 0 else 0 for a in batch.index.actuator]
         if not any(sizes):
             return command
-        data, history = mujoco.MjData(model), rig.batch.bind("history")
-        for s in range(rig.size):
+        data, history = mujoco.MjData(model), batch.simulations.bind("history")
+        for s in range(batch.size):
             for joint, size in enumerate(sizes):
                 if size:
                     rows = np.maximum(self.lead + np.arange(-size, 0), 0)
                     past = np.ascontiguousarray(command[min(s, len(command) - 1), rows, joint, None])
                     times = h * np.arange(-size, 0, dtype=np.float64)
-                    mujoco.mj_initCtrlHistory(model, data, int(rig.index.actuator[joint]), times[:, None], past)
+                    mujoco.mj_initCtrlHistory(model, data, int(batch.index.actuator[joint]), times[:, None], past)
             history[s] = data.history
         return command
 

@@ -8,7 +8,7 @@ from math import ceil
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Rig, Term
+from sysid_btr.terms.base import BatchModel, Fields, Term
 from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.constant_force import ConstantForce
 from sysid_btr.terms.encoder_offset import EncoderOffsetInLoop
@@ -71,7 +71,7 @@ def part_of(term: Term, values: FloatArray, numerics: Numerics, later: tuple[Ter
     hooks = [reason for hook, reason in REASONS.items() if type(term).overrides(hook)]
     if not hooks:
         return Part(term, values, term, "yes", "")
-    fields = type(term).overrides("write_fields") or type(term).overrides("edit_spec")
+    fields = type(term).overrides("model_fields") or type(term).overrides("edit_spec")
     return Part(term, values, term if fields else None, "no", " and ".join(hooks))
 
 
@@ -93,13 +93,15 @@ class AddedBody(Term):
                 body.explicitinertial = True
                 body.ipos, body.inertia = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
         # not in the spec: what the compiler derives from masses, such as dampings, is that of the bare robot
+        masses, inertias = batch.read("body_mass"), batch.read("body_inertia")
         for place, (mass, *_, inertia) in zip(self.places, self.loads, strict=True):
             if mass > 0:
-                body = rig.model.body(f"payload_{place}").id
-                rig.array("body_mass")[:, body] = mass
-                rig.array("body_inertia")[:, body] = inertia
+                body = batch.model.body(f"payload_{place}").id
+                masses[:, body], inertias[:, body] = mass, inertia
+        loaded = any(mass > 0 for mass, *_ in self.loads)
+        return {"body_mass": masses, "body_inertia": inertias} if loaded else {}
 
 
 def _payload(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
@@ -179,17 +181,18 @@ class SoftSpring(Term):
 
     name: ClassVar[str] = "constant_force"
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        stiffness, rest = rig.array("jnt_stiffness"), rig.array("qpos_spring")
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        stiffness, rest = batch.read("jnt_stiffness"), batch.read("qpos_spring")
         for place, torque in zip(self.places, self.torques, strict=True):
-            joint = rig.model.joint(place).id
-            at = int(rig.model.jnt_qposadr[joint])
+            joint = batch.model.joint(place).id
+            at = int(batch.model.jnt_qposadr[joint])
             k = float(stiffness[0, joint])
             if k == 0:
                 stiffness[:, joint] = k = SOFT * abs(torque)
                 rest[:, at] = 0.0
             if torque:
                 rest[:, at] += torque / k
+        return {"jnt_stiffness": stiffness, "qpos_spring": rest}
 
 
 def _constant(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
@@ -208,15 +211,16 @@ class ShiftedJoint(Term):
 
     name: ClassVar[str] = "encoder_offset"
 
-    def write_fields(self, rig: Rig, values: FloatArray) -> None:
-        zero, rest, limits = rig.array("qpos0"), rig.array("qpos_spring"), rig.array("jnt_range")
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        zero, rest, limits = batch.read("qpos0"), batch.read("qpos_spring"), batch.read("jnt_range")
         for place, offset in zip(self.places, self.offsets, strict=True):
-            joint = rig.model.joint(place).id
-            at = int(rig.model.jnt_qposadr[joint])
+            joint = batch.model.joint(place).id
+            at = int(batch.model.jnt_qposadr[joint])
             zero[:, at] += offset
             rest[:, at] += offset
-            if rig.model.jnt_limited[joint]:
+            if batch.model.jnt_limited[joint]:
                 limits[:, joint] += offset
+        return {"qpos0": zero, "qpos_spring": rest, "jnt_range": limits}
 
 
 def _reference(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:

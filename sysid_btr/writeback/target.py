@@ -13,7 +13,7 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.silence import silenced
-from sysid_btr.terms.base import Rig, Term
+from sysid_btr.terms.base import BatchModel, Term
 from sysid_btr.writeback.features import WRITTEN
 from sysid_btr.writeback.native import Part, part_of
 
@@ -68,13 +68,13 @@ def make_target(robot: Robot, log: Log, parts: Sequence[Part], numerics: Numeric
 
     writing = tuple(p.stand_in for p in parts if p.stand_in is not None)
     replayed = compile_model(robot, log, writing, numerics)
-    rig = Rig(replayed, Batch(replayed, 1, 1), make_index(replayed), numerics.timestep)
+    rig = BatchModel(replayed, Batch(replayed, 1, 1), make_index(replayed), numerics.timestep)
     fields: list[frozenset[str]] = []
     before: set[str] = set()
     for part in parts:
         rig.touched.clear()
         if part.stand_in is not None:
-            part.stand_in.write_fields(rig, part.values)
+            rig.write(part.stand_in.model_fields(rig, part.values))
         fields.append(frozenset(rig.touched))
         before |= rig.touched
     model = replayed
@@ -82,7 +82,7 @@ def make_target(robot: Robot, log: Log, parts: Sequence[Part], numerics: Numeric
         free = replace(log, meta=replace(log.meta, mount="free"))
         model = compile_model(robot, free, writing, numerics)
     for name in before:
-        _put(model, name, np.asarray(rig.batch.expanded(name)[0]))
+        _put(model, name, np.asarray(rig.simulations.expanded(name)[0]))
     with silenced():
         mujoco.mj_setConst(model, mujoco.MjData(model))
     held = tuple(_as_written(part, own) for part, own in zip(parts, fields, strict=True))
