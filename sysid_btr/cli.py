@@ -300,7 +300,7 @@ def validate(
     if as_json:
         _print_json({str(path): problems for path, problems in found.items()})
     else:
-        from sysid_btr.report.text import console, problems_table
+        from sysid_btr.display.text import console, problems_table
 
         out = console(sys.stdout)
         for path, problems in found.items():
@@ -396,8 +396,8 @@ def import_(
 
         _print_json(to_dict(imported, written))
     else:
+        from sysid_btr.display.text import console, problems_table
         from sysid_btr.report.imported import summary
-        from sysid_btr.report.text import console, problems_table
 
         screen = console(sys.stdout)
         for line in summary(imported):
@@ -498,7 +498,7 @@ def replay(
     if as_json:
         _print_json(result)
         return
-    from sysid_btr.report.text import console, joints_table, show
+    from sysid_btr.display.text import console, joints_table, show
 
     screen = console(sys.stdout)
     show(result, screen)
@@ -832,7 +832,7 @@ def btr(
     if as_json:
         _print_json(result)
     else:
-        from sysid_btr.report.text import console, show
+        from sysid_btr.display.text import console, show
 
         show(result, console(sys.stdout))
     if exit_code(result):
@@ -950,7 +950,7 @@ def excite(
     if as_json:
         _print_json(result)
     else:
-        from sysid_btr.report.text import console
+        from sysid_btr.display.text import console
 
         screen = console(sys.stdout)
         for part in outcome.show(result):
@@ -1073,10 +1073,10 @@ def _rehearse(
     """Play motions in the model; say how far every joint goes."""
     from itertools import zip_longest
 
+    from sysid_btr.display.text import console
     from sysid_btr.identify.replay import replay_log
     from sysid_btr.io.parquet import write_log
     from sysid_btr.report.motion import reach, reach_table
-    from sysid_btr.report.text import console
 
     if not all(one.is_motion for one in motions):
         raise UsageError("--log: motions to be played and recordings; give one or the other")
@@ -1149,7 +1149,7 @@ def _run(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool
     if as_json:
         _print_json(result)
     else:
-        from sysid_btr.report.text import console, show
+        from sysid_btr.display.text import console, show
 
         show(result, console(sys.stdout))
     return exit_code(result)

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, StepRecord
+from sysid_btr.display.text import console, show
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import ChannelScore, Scores
@@ -19,7 +20,6 @@ from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.html import Picture, render
-from sysid_btr.report.text import console, show
 from sysid_btr.result import clean, exit_code, make_result, read_result, to_json
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.units import si, si_all, with_digits_of

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from sysid_btr.cli import run
 from sysid_btr.demo import sample_logs
 from sysid_btr.diagnosis.closing import Closing
+from sysid_btr.display.changes import change_lines, model_lines
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.intervals import Estimate
@@ -29,7 +30,6 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
-from sysid_btr.report.changes import change_lines, model_lines
 from sysid_btr.run_folder import Folder
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.backlash import Backlash

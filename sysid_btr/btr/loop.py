@@ -209,9 +209,9 @@ class BackToReality:
 
     def _repr_html_(self) -> str:
         from sysid_btr.btr.result import btr_result
-        from sysid_btr.report.notebook import html_of_result
+        from sysid_btr.display.html import result_html
 
-        return html_of_result(btr_result(self))
+        return result_html(btr_result(self))
 
     @property
     def tried(self) -> tuple[Tried, ...]:

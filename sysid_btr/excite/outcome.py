@@ -138,7 +138,7 @@ def show(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     from rich.table import Table
     from rich.text import Text
 
-    from sysid_btr.report.text import number, told
+    from sysid_btr.display.text import number, told
 
     yield Text(result["message"], style="bold")
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold")

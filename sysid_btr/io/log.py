@@ -14,6 +14,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
+from sysid_btr.units import si
 
 T = TypeVar("T")
 
@@ -137,9 +138,22 @@ class Log:
         return len(self.time)
 
     def _repr_html_(self) -> str:
-        from sysid_btr.report.notebook import html_of_log
+        from sysid_btr.display.html import facts_html
 
-        return html_of_log(self)
+        return facts_html("log", self._facts)
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        """What was recorded, for how long, and which joints moved."""
+        facts = {
+            "robot": self.meta.robot or "not said",
+            "samples": f"{len(self)} in {len(self.episodes())} episode(s), {self.time[-1] - self.time[0]:.1f} s",
+            "sampled every": si(float(np.median(np.diff(self.time))), "s") if len(self) > 1 else "-",
+            "base": self.meta.mount,
+        }
+        for kind in dict.fromkeys(name.partition(".")[0] for name in self.channels):
+            facts[kind] = ", ".join(self.joints(kind))
+        return facts
 
     @property
     def is_motion(self) -> bool:

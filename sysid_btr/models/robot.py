@@ -47,9 +47,15 @@ class Robot:
     fields: Mapping[str, type[FieldTerm]] = field(default_factory=dict)
 
     def _repr_html_(self) -> str:
-        from sysid_btr.report.notebook import html_of_robot
+        from sysid_btr.display.html import facts_html
 
-        return html_of_robot(self)
+        facts = {
+            "joints": ", ".join(joint_names(self)),
+            "with a servo": ", ".join(servo_joints(self)),
+            "bodies": ", ".join(body_names(self)),
+            "mass": f"{float(self.compile().body_mass.sum()):.4g} kg",
+        }
+        return facts_html(f"robot {self.name}", facts)
 
     def for_log(self, log: Log) -> Robot:
         """The robot as this log's metadata describes it (servo registers, supply, load)."""

@@ -65,9 +65,10 @@ class Posterior:
     seconds: float
 
     def _repr_html_(self) -> str:
-        from sysid_btr.report.notebook import html_of_outcome
+        from sysid_btr.display.html import result_html
+        from sysid_btr.result import make_result
 
-        return html_of_outcome(self)
+        return result_html(make_result(self))
 
     @property
     def study(self) -> Study:

@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sysid_btr.report.changes import model_lines
-from sysid_btr.report.text import compact, number, stages, told, walk_words
+from sysid_btr.display.changes import model_lines
+from sysid_btr.display.text import compact, number, stages, told, walk_words
 from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:

@@ -3,20 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from sysid_btr.report.changes import model_lines
+from sysid_btr.display.changes import model_lines
 from sysid_btr.units import si_all, with_digits_of
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.table import Table
 
-    from sysid_btr.io.problem import Problem
-
 PLAIN_WIDTH = 118
 """Columns where the output is no terminal, so that what is piped does not depend on a window."""
 CANDIDATES_SHOWN = 6
+
+
+class Finding(Protocol):
+    """What is wrong with a log, as `io.problem.Problem` says it."""
+
+    @property
+    def severity(self) -> str: ...
+
+    @property
+    def code(self) -> str: ...
+
+    @property
+    def where(self) -> str: ...
+
+    @property
+    def message(self) -> str: ...
+
+    @property
+    def remedy(self) -> str: ...
 
 
 def console(stream: TextIO) -> Console:
@@ -151,7 +168,7 @@ def candidates_table(candidates: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def problems_table(problems: Sequence[Problem]) -> Table:
+def problems_table(problems: Sequence[Finding]) -> Table:
     """What is wrong with a log."""
     table = _table("")
     for name in ("where", "what is wrong", "what to do"):

@@ -1,0 +1,1 @@
+"""Contents of result.json as text and as HTML; knows dictionaries only."""
