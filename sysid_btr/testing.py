@@ -26,6 +26,7 @@ from sysid_btr.estimators.base import (
     ResidualProblem,
     Termination,
     silent,
+    uses_residuals,
 )
 from sysid_btr.estimators.journal import Journal
 
@@ -570,6 +571,23 @@ def check_refusals(estimator: Estimator) -> None:
         raise AssertionError(f"{estimator.name}: bounds or a start that cannot be used were not refused")
 
 
+def check_by_residuals(estimator: Estimator) -> None:
+    """One that minimises residuals takes no mere loss, and has variants that find the minimum well enough."""
+    if not uses_residuals(estimator):
+        return
+    try:
+        run(estimator, LossOnly(_decay()))
+    except UsageError:
+        pass
+    else:
+        raise AssertionError(f"{estimator.name}: uses_residuals, and takes a problem that has none")
+    whole, gain = run(estimator, _decay()), 0.5
+    allowed = whole.loss * (1.0 + 2.0 * gain / len(_decay().residuals(whole.x[None])[0]))
+    for variant in (estimator.for_rough_objective(1e-2, gain), estimator.unconfirmed()):
+        require(uses_residuals(variant), f"{estimator.name}: a variant of it does not use residuals")
+        require(run(variant, _decay()).loss <= allowed, f"{estimator.name}: a variant of it stops far from the minimum")
+
+
 ESTIMATOR_CHECKS: tuple[Callable[[Estimator], None], ...] = (
     check_result,
     check_budget,
@@ -579,5 +597,6 @@ ESTIMATOR_CHECKS: tuple[Callable[[Estimator], None], ...] = (
     check_interruption,
     check_resume,
     check_refusals,
+    check_by_residuals,
 )
 """What `check_estimator` runs; usable one by one."""

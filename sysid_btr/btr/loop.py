@@ -31,11 +31,10 @@ from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, silent
-from sysid_btr.estimators.chain import Chain
+from sysid_btr.estimators.chain import needs_residuals
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.models.robot import Robot as Model
 from sysid_btr.objectives.distance import get_distance
 from sysid_btr.terms.base import Parameter, Term
@@ -130,7 +129,7 @@ class Settings:
             raise UsageError("btr: iterations, trials, memory and rivals must be at least 1")
         if self.close and self.correct:
             raise UsageError("btr: with a linear correction the model stays as it is; nothing can be added to it")
-        if _by_residuals(self.models) and self.distance != LIKELIHOOD:
+        if needs_residuals(self.models) and self.distance != LIKELIHOOD:
             raise UsageError(f"btr: least squares minimises a likelihood; give --distance {LIKELIHOOD}, or cmaes or ga")
         get_choice(self.choice)
         if self.distance != FITNESS:
@@ -532,12 +531,6 @@ def _rank_correlation(a: FloatArray, b: FloatArray) -> float:
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         return 0.0
     return float(np.corrcoef(x, y)[0, 1])
-
-
-def _by_residuals(estimator: Estimator) -> bool:
-    """Whether an estimator needs residuals, and not only a loss."""
-    stages = estimator.stages if isinstance(estimator, Chain) else (estimator,)
-    return any(isinstance(stage, LeastSquares) for stage in stages)
 
 
 def _all_of(journal: Journal) -> tuple[FloatArray, FloatArray]:

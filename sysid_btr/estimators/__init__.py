@@ -11,14 +11,16 @@ from sysid_btr.estimators.base import (
     FitResult,
     Problem,
     Progress,
+    ResidualEstimator,
     ResidualProblem,
     Termination,
     UnitBox,
     has_residuals,
     require_residuals,
     silent,
+    uses_residuals,
 )
-from sysid_btr.estimators.chain import Chain
+from sysid_btr.estimators.chain import Chain, needs_residuals
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.derivative_free import NLopt
 from sysid_btr.estimators.ensemble import Ensemble
@@ -45,6 +47,7 @@ __all__ = [
     "Progress",
     "Record",
     "Reduced",
+    "ResidualEstimator",
     "ResidualProblem",
     "Stop",
     "Termination",
@@ -54,6 +57,8 @@ __all__ = [
     "get_estimator",
     "has_residuals",
     "linearise",
+    "needs_residuals",
     "require_residuals",
     "silent",
+    "uses_residuals",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, Self, TypeGuard, runtime_checkable
 
 import numpy as np
 
@@ -178,6 +178,40 @@ class Estimator(Protocol):
     ) -> FitResult:
         """Minimise ``problem.loss`` within its bounds."""
         ...
+
+
+class ResidualEstimator(Estimator, Protocol):
+    """An estimator that minimises squared residuals, and so takes a `ResidualProblem`.
+
+    What least squares need, `identify` does around any of them: columns that the model cannot explain count less, the
+    integrator's step is checked at the estimates, and what is not identifiable is fixed at its nominal value.
+    """
+
+    @property
+    def uses_residuals(self) -> bool:
+        """True; an estimator without this attribute needs losses alone."""
+        ...
+
+    def for_rough_objective(self, step: float, least_gain: float) -> Self:
+        """Itself, for residuals that impacts roughen.
+
+        Parameters
+        ----------
+        step
+            Finite-difference step, fraction of a parameter's range, that is wide against the roughness.
+        least_gain
+            Decrease of the loss, in mean squared residuals, below which no further step is worth its simulations.
+        """
+        ...
+
+    def unconfirmed(self) -> Self:
+        """Itself, without what it does at the minimum for a Jacobian that nobody will ask for."""
+        ...
+
+
+def uses_residuals(estimator: Estimator) -> TypeGuard[ResidualEstimator]:
+    """Whether an estimator minimises squared residuals."""
+    return bool(getattr(estimator, "uses_residuals", False))
 
 
 def has_residuals(problem: Problem) -> TypeGuard[ResidualProblem]:

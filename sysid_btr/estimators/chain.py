@@ -15,9 +15,9 @@ from sysid_btr.estimators.base import (
     Progress,
     Termination,
     require_residuals,
+    uses_residuals,
 )
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -67,7 +67,7 @@ class Chain:
         UsageError
             A stage cannot take the problem; said before the first begins.
         """
-        if any(isinstance(stage, LeastSquares) for stage in self.stages):
+        if needs_residuals(self):
             require_residuals(problem, self.name)
         return self._run(len(self.stages), problem, rng, budget, journal, progress)
 
@@ -113,10 +113,8 @@ class Chain:
 
     def _stage(self, i: int) -> Estimator:
         stage = self.stages[i]
-        if i + 1 < len(self.stages) and isinstance(stage, LeastSquares):
-            # Nobody asks for its Jacobian, and a journal keeps only the latest.
-            return replace(stage, confirm=False)
-        return stage
+        # nobody asks for the Jacobian of one that is not the last, and a journal keeps only the latest
+        return stage.unconfirmed() if i + 1 < len(self.stages) and uses_residuals(stage) else stage
 
     def _share(self, i: int, p: int, left: int | None) -> int | None:
         if i + 1 == len(self.stages):
@@ -134,6 +132,11 @@ class Chain:
             progress(done=before + done, total=budget.evaluations, best=min(best, floor), note=told)
 
         return report
+
+
+def needs_residuals(estimator: Estimator) -> bool:
+    """Whether an estimator, or a stage of it, minimises squared residuals."""
+    return any(map(needs_residuals, estimator.stages)) if isinstance(estimator, Chain) else uses_residuals(estimator)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ parameters that cannot be told apart stay where they are.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -284,6 +284,26 @@ class LeastSquares:
     def name(self) -> str:
         """``lsq``."""
         return "lsq"
+
+    @property
+    def uses_residuals(self) -> bool:
+        """It minimises squared residuals."""
+        return True
+
+    def for_rough_objective(self, step: float, least_gain: float) -> Self:
+        """Wider differences, few iterations and a coarser end."""
+        return replace(
+            self,
+            tolerance=max(self.tolerance, 1e-4),
+            forward_step=max(self.forward_step, step),
+            central_step=max(self.central_step, step),
+            max_iterations=min(self.max_iterations, 8),
+            least_gain=least_gain,
+        )
+
+    def unconfirmed(self) -> Self:
+        """No central differences at the minimum."""
+        return replace(self, confirm=False)
 
     def fit(
         self, problem: Problem, *, rng: Generator, budget: Budget, journal: Journal, progress: Progress
