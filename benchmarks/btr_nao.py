@@ -109,10 +109,11 @@ def hidden_robot(seed: int, threads: int = 1) -> HiddenRobot:
     model = load_robot("nao")
     joints = servo_joints(model)
     friction = np.random.default_rng([seed, 1000]).uniform(*FRICTION, len(joints))
-    terms, values = set_parameters(model, {**{f"mass:{n}": f for n, f in V32.items()}, "kp:*=shared": GAIN})
-    terms = (*terms, CommandDelay(places=joints, shared=True), CoulombFriction(places=joints))
-    world = replace(make_world(model, TASK, terms, threads=threads), numerics=HIDDEN)
-    return HiddenRobot(world, np.concatenate([values, [DELAY], friction]), TASK, NaoGait(), Noise(), seed)
+    truth = set_parameters(model, {**{f"mass:{n}": f for n, f in V32.items()}, "kp:*=shared": GAIN})
+    truth = truth.with_(CommandDelay(places=joints, shared=True), [DELAY])
+    truth = truth.with_(CoulombFriction(places=joints), friction)
+    world = replace(make_world(model, TASK, truth.terms, threads=threads), numerics=HIDDEN)
+    return HiddenRobot(world, truth.values, TASK, NaoGait(), Noise(), seed)
 
 
 def run_seed(seed: int, plan: Plan, out: Path, threads: int) -> dict[str, Any]:

@@ -44,6 +44,7 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Model
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "distances.json"
@@ -108,14 +109,12 @@ class Hidden:
 
     def play(self, asked: Log) -> Log:
         """What the leg does when commands are played on it."""
-        terms, values = self.free, self.truth
+        model = Model.of(self.free, self.truth)
         if self.condition == "masses":
             factors = self.draw(1).uniform(*SPREAD, len(OTHERS))
-            wrong, others = set_parameters(
-                self.robot, {f"mass:{b}": float(f) for b, f in zip(OTHERS, factors, strict=True)}
-            )
-            terms, values = (*terms, *wrong), np.concatenate([values, others])
-        return moved(Replay(self.robot, asked, terms, HIDDEN, threads=1), values)
+            others = {f"mass:{b}": float(f) for b, f in zip(OTHERS, factors, strict=True)}
+            model = Model.joined([*model.parts, *set_parameters(self.robot, others).parts])
+        return moved(Replay(self.robot, asked, model.terms, HIDDEN, threads=1), model.values)
 
     @cached_property
     def logs(self) -> list[Log]:

@@ -174,7 +174,7 @@ def _peer_parameters(problem: ReplayProblem, spec: Any, plain: Any) -> Any:
         def modify(spec: Any, parameter: Any, write: Callable[[Any, float], None] = write) -> None:
             write(spec, parameter.value[0])
 
-        params.add(sysid.Parameter(p.name, p.nominal, p.lower, p.upper, term=modify))
+        params.add(sysid.Parameter(p.name, p.nominal, p.lower, p.upper, modifier=modify))
     return params
 
 

@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.gantry import data_folder
+from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.study import Study
-    from sysid_btr.terms.base import Term
 
 FOLDS = ("none", "kp100", "kp200", "kp400")
 DECLARED = ("torque_constant:pendulum",)
@@ -122,50 +122,41 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
         "rungs": [
             {
                 "added": added,
-                "numbers": {p.name: float(v) for p, v in zip(parameters(m), values, strict=True)},
-                "error": dict(zip(names, errors(whole, m, values), strict=True)),
+                "numbers": dict(zip(model.terms.names, map(float, model.values), strict=True)),
+                "error": dict(zip(names, errors(whole, model), strict=True)),
             }
-            for added, m, values in rungs
+            for added, model in rungs
         ],
         "held_out": [n for n in names if n.startswith(fold)],
         "seconds": round(perf_counter() - began),
     }
 
 
-def parameters(terms: Sequence[Term]) -> list[Any]:
-    return [p for m in terms for p in m.parameters]
-
-
-def climb(found: Closing, study: Study) -> list[tuple[str, tuple[Term, ...], Any]]:
+def climb(found: Closing, study: Study) -> list[tuple[str, Model]]:
     """Least squares with the first effect, the first two, and so on, in the order in which they were found."""
     from sysid_btr.identify.refit import refit
 
     order = [label.split(" at ")[0] for step in found.steps for label in step.added]
-    declared = found.before_terms
+    declared = found.before_model.terms
     effects = sorted(
-        found.terms[len(declared) :],
+        found.model.terms[len(declared) :],
         key=lambda m: order.index(m.label or m.name) if (m.label or m.name) in order else len(order),
     )
-    values_of, column = {}, 0
-    for term in found.terms:
-        values_of[term] = found.values[column : column + len(term.parameters)]
-        column += len(term.parameters)
     result = []
     for count in range(len(effects) + 1):
-        terms = (*declared, *effects[:count])
-        start = np.concatenate([values_of[m] for m in terms])
-        fitted = refit(study, terms, start, iterations=20)
+        start = Model.joined((term, found.model.own(term)) for term in (*declared, *effects[:count]))
+        fitted = refit(study, start, iterations=20)
         added = (effects[count - 1].label or effects[count - 1].name) if count else "torque constant alone"
-        result.append((added, terms, fitted.values))
+        result.append((added, fitted.model))
     return result
 
 
-def errors(study: Study, terms: tuple[Term, ...], values: Any) -> list[float]:
+def errors(study: Study, model: Model) -> list[float]:
     """Mean absolute position error of every log, rad."""
-    problem = study.train_problem(terms)
+    problem = study.train_problem(model)
     result = []
     for episode in problem.episodes:
-        outputs = episode.replay.predict(values[None])
+        outputs = episode.replay.predict(model.values[None])
         (target,) = episode.targets
         result.append(float(np.nanmean(np.abs(target.measured - target.predicted(outputs)[0]))))
     return result

@@ -34,7 +34,6 @@ from sysid_btr.run_folder import Folder
 from sysid_btr.saving import as_model, write_all
 
 if TYPE_CHECKING:
-    from sysid_btr._typing import FloatArray
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.estimators.journal import Journal
     from sysid_btr.identify.fit import Fit
@@ -43,7 +42,8 @@ if TYPE_CHECKING:
     from sysid_btr.models.robot import Robot
     from sysid_btr.posterior.draw import Posterior
     from sysid_btr.simulation.numerics import Numerics
-    from sysid_btr.terms.base import Term
+    from sysid_btr.terms.model import Model as TermModel
+    from sysid_btr.terms.model import Terms
 
     Job = Callable[[Study, ProgressLine], Fit | Closing | Posterior]
 
@@ -479,20 +479,20 @@ def replay(
     robot = find_robot(model, None)
     logs = read_logs(log, motions=True)
     parameters = dict(assignments("--set", set_))
-    terms, values = set_parameters(robot, parameters)
+    changed = set_parameters(robot, parameters)
     numerics = None
     if params is not None:
-        terms, values, numerics = with_params(params, robot, terms, values)
+        changed, numerics = with_params(params, robot, changed)
     targets = replay_targets(out, logs, overwrite)
     if any(one.is_motion for one in logs):
-        _rehearse(robot, logs, (terms, values), numerics, targets, overwrite, threads, as_json)
+        _rehearse(robot, logs, changed, numerics, targets, overwrite, threads, as_json)
         return
     study = make_study(robot, logs, holdout=logs, channels=COMPARED, numerics=numerics, threads=threads)
-    scores = score_problem(study.train_problem(terms), values)
+    scores = score_problem(study.train_problem(changed), changed.values)
     for path, one in zip(targets, logs, strict=False):
         from sysid_btr.io.parquet import write_log
 
-        predicted = replay_log(robot, one, (terms, values), numerics=study.numerics, threads=threads)
+        predicted = replay_log(robot, one, changed, numerics=study.numerics, threads=threads)
         write_log(predicted, path, overwrite=overwrite)
     result = replay_result(study, scores, parameters, time.perf_counter() - began)
     if as_json:
@@ -569,7 +569,7 @@ def fit(
 
     def job(study: Study, progress: ProgressLine) -> Fit:
         terms = study.declare(free)
-        wanted = chosen_names([p.name for m in terms for p in m.parameters], profile or [])
+        wanted = chosen_names(terms.names, profile or [])
         return with_profiles(search(study, terms, _generator(seed), keeper.journal, progress), wanted, progress)
 
     _finish(request, keeper, job, as_json, render)
@@ -657,9 +657,8 @@ def posterior(
 
     def job(study: Study, progress: ProgressLine) -> Posterior:
         terms = study.declare(free)
-        parameters = [p for m in terms for p in m.parameters]
-        choose_priors(parameters, believed, robot.priors)
-        walkers_for(len(parameters), walkers)
+        choose_priors(terms.parameters, believed, robot.priors)
+        walkers_for(len(terms.parameters), walkers)
         rng = _generator(seed)
         return draw_posterior(
             search(study, terms, rng, keeper.journal, progress),
@@ -1011,7 +1010,7 @@ def _search(
     robot: Robot,
     start: list[str] | None,
     params: Path | None,
-) -> Callable[[Study, Sequence[Term], Any, Journal, ProgressLine], Fit]:
+) -> Callable[[Study, Terms, Any, Journal, ProgressLine], Fit]:
     """A fit as the flags ask for it, of whatever study."""
     from sysid_btr.estimators import get_estimator
     from sysid_btr.estimators.base import Budget
@@ -1020,10 +1019,8 @@ def _search(
 
     chosen, wanted = get_estimator(estimator), get_distance(distance)
 
-    def search(
-        study: Study, terms: Sequence[Term], rng: Any, journal: Journal, progress: ProgressLine
-    ) -> Fit:
-        parameters = [p for m in terms for p in m.parameters]
+    def search(study: Study, terms: Terms, rng: Any, journal: Journal, progress: ProgressLine) -> Fit:
+        parameters = terms.parameters
         return fit_study(
             study,
             terms,
@@ -1046,7 +1043,7 @@ def _closing_job(
         from sysid_btr.diagnosis.close import close as close_loop
 
         terms = study.declare(parameters)
-        free = [p for m in terms for p in m.parameters]
+        free = terms.parameters
         return close_loop(
             study,
             terms,
@@ -1063,7 +1060,7 @@ def _closing_job(
 def _rehearse(
     robot: Robot,
     motions: Sequence[Log],
-    chosen: tuple[tuple[Term, ...], FloatArray],
+    chosen: TermModel,
     numerics: Numerics | None,
     targets: Sequence[Path],
     overwrite: bool,

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log
     from sysid_btr.models.robot import Robot
     from sysid_btr.simulation.numerics import Numerics
-    from sysid_btr.terms.base import Parameter, Term
+    from sysid_btr.terms.base import Parameter
+    from sysid_btr.terms.model import Model
 
 DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
 """What `close` frees where nothing is said: a wrong mass or gain must not pass for an effect."""
@@ -268,20 +269,17 @@ def known_starts(path: Path | None, robot: Robot, parameters: Sequence[Parameter
     return given
 
 
-def with_params(
-    path: Path, robot: Robot, terms: Sequence[Term], values: FloatArray
-) -> tuple[tuple[Term, ...], FloatArray, Numerics]:
-    """A model of an earlier run, further changed by terms with their values; and its numerics."""
-    import numpy as np
-
+def with_params(path: Path, robot: Robot, model: Model) -> tuple[Model, Numerics]:
+    """A model of an earlier run, further changed by the terms of another; and its numerics."""
+    from sysid_btr.terms.model import Model
     from sysid_btr.writeback.params import read_params
 
     params = read_params(path, robot)
-    taken = {(m.name, place) for m in params.terms for place in m.places}
-    twice = [f"{m.name}:{place}" for m in terms for place in m.places if (m.name, place) in taken]
+    taken = {(m.name, place) for m in params.model.terms for place in m.places}
+    twice = [f"{m.name}:{place}" for m in model.terms for place in m.places if (m.name, place) in taken]
     if twice:
         raise UsageError(f"given by --set and by --params: {', '.join(twice)}; give one of the two")
-    return (*params.terms, *terms), np.concatenate([params.values, values]), params.numerics
+    return Model.joined([*params.model.parts, *model.parts]), params.numerics
 
 
 def assignments(flag: str, given: list[str] | None) -> list[tuple[str, float]]:

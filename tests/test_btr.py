@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sysid_btr.btr.choice import Pool, disagreement, fittest, pool_of
-from sysid_btr.btr.closing import _tell_apart, join_effects
+from sysid_btr.btr.closing import Joined, _tell_apart, join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
@@ -28,7 +28,6 @@ from sysid_btr.cli import run
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators import CmaEs, GeneticAlgorithm, Record
 from sysid_btr.identify.refit import judge
-from sysid_btr.identify.study import nominal_start
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.validation import validate_log
@@ -43,6 +42,7 @@ from sysid_btr.terms.base import BatchModel, Term
 from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Model, Terms
 
 MODEL = load_robot("ant")
 TASK = Walk(1.0)
@@ -346,8 +346,8 @@ def test_what_trials_do_not_tell_stays_as_it_was() -> None:
     assert log is not None
     unseen = parse_parameters(["damping:LFCoxa"], MODEL)[0]
     free = (*terms(), replace(unseen, places=("LFCoxa",)))
-    start = np.array([1.1, 0.9, nominal_start(free)[2]])
-    problem = Beginnings(trial_study(stage(), [log], [], 1).train_problem(free, start))
+    start = np.array([1.1, 0.9, Terms(free).nominal[2]])
+    problem = Beginnings(trial_study(stage(), [log], [], 1).train_problem(Model.of(free, start)))
     candidates = np.vstack([start, start + problem.width])
     residuals = problem.residuals(candidates)
     np.testing.assert_allclose(residuals[:, -3:], [[0, 0, 0], [1, 1, 1]], atol=1e-12)
@@ -453,14 +453,9 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
     def look(own: Stage, values: np.ndarray, tried: Sequence[Tried], n: int, progress: object) -> object:
         asked.append(len(tried))
         if len(asked) > 1:
-            return {"message": "nothing more", "params": None}
-        found, numbers = (*declared, delay), np.array([1.1, 0.9, 0.02])
-        return {
-            "message": "20 ms of delay",
-            "params": params_entry(found, numbers),
-            "modifiers": found,
-            "values": numbers,
-        }
+            return Joined("nothing more"), None
+        study = trial_study(own, early_logs(own, tried, 1), (), n)
+        return Joined("20 ms of delay", Model.of((*declared, delay), [1.1, 0.9, 0.02])), study
 
     monkeypatch.setattr("sysid_btr.btr.closing._look", look)
     monkeypatch.setattr("sysid_btr.btr.loop.STUCK", -1.0)
@@ -483,11 +478,11 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
 def test_a_trial_is_replayed_as_it_was_made() -> None:
     log = hidden(SILENT).run(Controller(some_controllers(1)[0])).log
     assert log is not None
-    problem = trial_study(stage(), [log], [log], 1).train_problem(terms(), np.ones(2))
+    problem = trial_study(stage(), [log], [log], 1).train_problem(Model.of(terms(), np.ones(2)))
     ((_, outputs),) = problem.episodes[0].replay.chunks(TRUTH[None])
     assert np.array_equal(problem.episodes[0].targets[0].predicted(outputs)[0], problem.episodes[0].targets[0].measured)
     # the part that a shorter log has, and trials together
-    half = trial_study(stage(), [log.window(0, 26), log], [log], 1).train_problem(terms(), np.ones(2))
+    half = trial_study(stage(), [log.window(0, 26), log], [log], 1).train_problem(Model.of(terms(), np.ones(2)))
     assert half.residuals(TRUTH[None]).shape == (1, (26 + 51) * 18)
     assert np.abs(half.residuals(TRUTH[None])).max() == 0
 
@@ -513,10 +508,11 @@ def test_effects_are_found_in_trials_of_a_robot_that_stands_on_its_own() -> None
     late = HiddenRobot(world, np.array([*TRUTH, 0.03]), TASK, SPACE, Noise())
     tried = [Tried(1, Controller(c), 0.0, late.run(Controller(c))) for c in 0.5 * some_controllers(2)]
     joined = join_effects(stage(), np.ones(2), tried, None, 1)
-    named = [m for m in joined.terms if isinstance(m, Effect)]
+    assert joined.model is not None
+    named = [m for m in joined.model.terms if isinstance(m, Effect)]
     assert [m.name for m in named] in (["command_delay"], ["sensor_delay"])
-    assert abs(joined.values[-1] - 0.03) < 0.002
-    assert np.all(np.abs(joined.values[:2] - TRUTH) < np.abs(1 - TRUTH))
+    assert abs(joined.model.values[-1] - 0.03) < 0.002
+    assert np.all(np.abs(joined.model.values[:2] - TRUTH) < np.abs(1 - TRUTH))
     assert joined.simulations > 10
 
 
@@ -530,42 +526,16 @@ def test_an_effect_has_amounts_of_its_own_where_held_out_trials_want_that(apart:
     assert all(log is not None for log in logs)
     study = trial_study(stage(), [log for log in logs[:2] if log], [log for log in logs[2:] if log], 1)
     shared = CommandDelay(places=places, shared=True)
-    lengths = [(m, (float(v),)) for m, v in zip(terms(), TRUTH, strict=True)]
-    alike = [*lengths, (shared, (float(delays.mean()),))]
-    left = judge(study, (*terms(), shared), np.array([*TRUTH, delays.mean()])).holdout
-    found, holdout, spent = _tell_apart(study, alike, len(lengths), left)
+    alike = Model.of((*terms(), shared), [*TRUTH, delays.mean()])
+    left = judge(study, alike).holdout
+    found, holdout, spent = _tell_apart(study, alike, len(terms()), left)
     assert spent > 1
-    assert found[-1][0].shared is not apart
+    assert found.terms[-1].shared is not apart
     if apart:
         assert holdout < 0.2 * left
-        assert np.abs(np.array(found[-1][1]) - delays).max() < 0.005
+        assert np.abs(found.own(found.terms[-1]) - delays).max() < 0.005
     else:
         assert (holdout, found) == (left, alike)
-
-
-def params_entry(found: Sequence[Term], values: np.ndarray) -> dict[str, object]:
-    entries, column = [], 0
-    for m in found:
-        own = values[column : column + len(m.parameters)]
-        column += len(own)
-        entries.append(
-            {
-                "kind": "effect" if m.name == "command_delay" else "parameter",
-                "name": m.name,
-                "variant": "",
-                "where": list(m.places),
-                "shared": m.shared,
-                "parameters": [
-                    {"name": p.name, "value": v, "unit": p.unit, "nominal": p.nominal, "bounds": (p.lower, p.upper),
-                     "scale": p.scale} for p, v in zip(m.parameters, own, strict=True)
-                ],
-            }
-        )  # fmt: skip
-    return {
-        "schema": "sysid_btr.params/1",
-        "numerics": {"integrator": "RK4", "timestep": 0.005},
-        "modifiers": entries,
-    }
 
 
 def rounds(best: Sequence[float], real: Callable[[float], float]) -> list[Iteration]:

@@ -19,7 +19,7 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.scan import Question, Trace, where_something_is
 from sysid_btr.estimators import Journal
 from sysid_btr.identify.refit import judge
-from sysid_btr.identify.study import make_study, nominal_start
+from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
@@ -36,6 +36,7 @@ from sysid_btr.terms.gravity_tilt import GravityTilt
 from sysid_btr.terms.integral_gain import IntegralGain
 from sysid_btr.terms.joint_compliance import JointCompliance
 from sysid_btr.terms.joint_spring import JointSpring
+from sysid_btr.terms.model import Model
 from sysid_btr.terms.payload import Payload
 from sysid_btr.terms.quadratic_damping import QuadraticDamping
 from sysid_btr.terms.sensor_delay import SensorDelay
@@ -183,7 +184,7 @@ def test_every_step_and_candidate_is_recorded(name: str) -> None:
     found = sample(name)
     assert found.steps[0].added == ()
     assert found.replays > 0
-    assert len(found.values) == sum(len(m.parameters) for m in found.terms)
+    assert len(found.values) == len(found.model.terms.parameters)
     if found.effects:
         assert any(c.effect == found.effects[0].effect for c in found.candidates)
         assert found.steps[-1].holdout < found.steps[0].holdout
@@ -405,11 +406,11 @@ def test_a_hypothesis_that_is_too_fast_for_the_step_is_tried_with_a_shorter_one(
     plant = next(p for p in PLANTS if p.effect.name == "joint_compliance")
     coarse = make_study(toys.leg(), [recorded(plant)], numerics=Numerics("RK4", 0.02))
     declared = coarse.declare(TOY_FIT)
-    plain = judge(coarse, declared, nominal_start(declared))
+    plain = judge(coarse, Model.of(declared))
     soft = Hypothesis(JointCompliance, ("ankle",), False, np.array([0.003]), 0.0)
-    diverging = judge(coarse, (*declared, soft.term(coarse.scales)), np.append(plain.values, soft.start))
+    diverging = judge(coarse, plain.model.with_(soft.term(coarse.scales), soft.start))
     assert np.isfinite(plain.holdout)
     assert np.isnan(diverging.holdout)
-    found = closing._try(coarse, closing._State(plain, ()), soft)
+    found = closing._try(coarse, plain.model, soft)
     assert np.isfinite(found.holdout)
     assert found.numerics.timestep < 0.02

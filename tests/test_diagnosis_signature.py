@@ -35,6 +35,7 @@ from sysid_btr.terms.external_disturbance import (
     pulses,
 )
 from sysid_btr.terms.library import EFFECTS
+from sysid_btr.terms.model import Model
 
 NOISE = 4e-4
 """rad, of a position sensor."""
@@ -84,7 +85,7 @@ def asked(log: Log, library: Sequence[type[Effect]] = EFFECTS) -> list[Question]
 
 
 def described(log: Log) -> dict[str, Any]:
-    found = signature(study_of(log), (), NOTHING)
+    found = signature(study_of(log), Model.of(()))
     json.dumps(found)
     return found
 
@@ -234,7 +235,7 @@ def test_bounds_around_a_guess_let_a_fit_refine_its_times(
     pulse = effect.at(("knee",), study.scales).around(guess)
     assert all(p.lower <= g <= p.upper for p, g in zip(pulse.parameters, guess, strict=True))
     assert pulse.neutral[0] == 0
-    found = refit(study, (pulse,), guess).values
+    found = refit(study, Model.of((pulse,), guess)).model.values
     assert found == pytest.approx(truth, abs=0.01, rel=0.03)
     assert found[1] == pytest.approx(truth[1], abs=0.004)
 
@@ -285,7 +286,7 @@ def unexplained(effect: str) -> dict[str, Any]:
     spec = Recording(LEG, seed=3, seconds=16, mass={"KneePitch": 1.1}, effects=(parse_effect(effect),))
     study = make_study(load_robot(LEG), [record(spec)[0]], holdout=0.1)
     terms = study.declare(["mass:*Knee*", "kp:*=shared"])
-    return signature(study, terms, refit(study, terms, np.ones(2)).values)
+    return signature(study, refit(study, Model.of(terms, np.ones(2))).model)
 
 
 @pytest.mark.parametrize(
@@ -312,7 +313,7 @@ def test_what_is_in_no_library_is_described_as_what_it_is(effect: str, best: str
 def test_the_recorded_dropout_is_periodic_with_its_period() -> None:
     study = make_study(load_robot(LEG), [read_log(Path(LEG).with_name("leg_dropout.parquet"))])
     terms = study.declare(["mass:*Knee*", "kp:*=shared"])
-    found = signature(study, terms, refit(study, terms, np.ones(2)).values)
+    found = signature(study, refit(study, Model.of(terms, np.ones(2))).model)
     knee = found["joints"][0]
     assert (knee["joint"], knee["best"]) == ("KneePitch", "torque_and_phase")
     assert knee["periodic"]["period"] == pytest.approx(1.7, abs=0.01)
@@ -323,12 +324,12 @@ def test_the_measured_pulses_of_emps_are_found(shared_data: Path) -> None:
     study = make_study(emps(), [log], holdout=0.1)
     terms = study.declare(["mass:*", "damping:*", "frictionloss:*", "constant_force:*"])
     values = np.array([1.0, 203.5, 20.4, 3.16])
-    problem = study.train_problem(terms, values)
+    problem = study.train_problem(Model.of(terms, values))
     residual = problem.residuals(values[None])[0]
     found = proposals(study, problem, values, residual, (ExternalDisturbanceTrain, DriveDisturbanceTrain))
     assert [q.effect for q in found] == [ExternalDisturbanceTrain, DriveDisturbanceTrain]
     assert found[0].probe[0][1:] == pytest.approx((0.344, 0.5, 1.0), abs=0.004)
-    (slider,) = signature(study, terms, values)["joints"]
+    (slider,) = signature(study, problem.model)["joints"]
     assert slider["periodic"]["amplitude"] == pytest.approx(178, rel=0.03)
     assert slider["best"] == "phase"
 

@@ -42,6 +42,7 @@ from sysid_btr.objectives.marginal import Projection
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.library import select_effects
+from sysid_btr.terms.model import Model
 
 FREE = ("mass:*", "kp:*=shared", "kv:*=shared")
 QUICK = Numerics("RK4", 0.005)
@@ -256,7 +257,7 @@ def test_logs_and_model_are_sent_once(pool: DaskExecutor) -> None:
         whole.loss(candidates(whole, 4, seed))
     assert len(pool._held.packs) == 1
     sent = set(pool._held.where)
-    changed = whole.with_terms(study().declare(["mass:knee"]), np.ones(1))
+    changed = whole.with_model(Model.of(study().declare(["mass:knee"])))
     changed.loss(np.linspace(0.9, 1.1, 4)[:, None])
     assert len(set(pool._held.where) - sent) == 1  # the terms, in the problem's own content
 

@@ -69,7 +69,7 @@ def test_the_surrogate_was_good_and_says_so(leg: Posterior) -> None:
 
 
 def test_every_draw_was_replayed(leg: Posterior) -> None:
-    problem = leg.study.train_problem(leg.fit.terms)
+    problem = leg.study.train_problem(leg.fit.model.terms)
     which = np.arange(0, len(leg.sample.flat), 97)
     loss = problem.loss(leg.sample.flat[which])
     u = leg.likelihood.box.enter(leg.sample.flat[which])

@@ -61,7 +61,7 @@ def test_moments_are_where_the_models_differ_most(fitted: Any) -> None:
 def test_poses_are_those_of_log_and_replay(fitted: Any) -> None:
     scene, log = scene_of(fitted), fitted.study.holdout[0]
     np.testing.assert_array_equal(scene.poses["log"][:, 0], log.channels["position.pendulum"])
-    replay = fitted.study.holdout_problem(fitted.terms).episodes[0].replay
+    replay = fitted.study.holdout_problem(fitted.model).episodes[0].replay
     np.testing.assert_array_equal(
         scene.poses["model after"][:, 0], replay.predict(fitted.values[None]).position[0, :, 0]
     )

@@ -22,6 +22,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.html import Picture, render
 from sysid_btr.result import clean, exit_code, make_result, read_result, to_json
 from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.terms.model import Model
 from sysid_btr.units import si, si_all, with_digits_of
 
 PROMISED = {
@@ -111,10 +112,8 @@ def closing(study: Study, **changes: object) -> Closing:
         "candidates": (Candidate("coulomb_friction", ("hinge",), 0.9, math.nan, ()),),
         "steps": (StepRecord((), (), 44.0, 45.0), StepRecord(("coulomb_friction at hinge",), (), 1.0, 1.1)),
         "signature": {"period": np.float64(1.7), "joints": ["hinge"]},
-        "before_terms": (),
-        "before_values": np.zeros(0),
-        "modifiers": (),
-        "values": np.zeros(0),
+        "before_model": Model.of(()),
+        "model": Model.of(()),
         "replays": 12,
         "seconds": 1.5,
     }

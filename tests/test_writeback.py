@@ -45,6 +45,7 @@ from sysid_btr.terms.integral_gain import IntegralGain
 from sysid_btr.terms.joint_compliance import JointCompliance
 from sysid_btr.terms.joint_spring import JointSpring
 from sysid_btr.terms.load_friction import LoadFriction
+from sysid_btr.terms.model import Model
 from sysid_btr.terms.payload import Payload
 from sysid_btr.terms.torque_limit import TorqueLimit
 from sysid_btr.writeback.params import read_params, starts_from
@@ -149,7 +150,7 @@ def study_of(robot: Robot, numerics: Numerics = NUMERICS, log: Log | None = None
 
 
 def model_of(study: Study, terms: Sequence[Term], values: Sequence[float]) -> Identified:
-    return Identified(study, tuple(terms), np.asarray(values, dtype=np.float64), (), ())
+    return Identified(study, Model.of(terms, values), (), ())
 
 
 def declared(path: Path, expressions: Sequence[str], values: Sequence[float], **options: Any) -> Identified:
@@ -528,7 +529,7 @@ np.save(sys.argv[3], np.array(places))
 
 def plain_loss(path: Path, model: Identified, folder: Path) -> tuple[float, float]:
     """Loss on held-out data by MuJoCo alone, in a process that knows nothing of this package; and as reported."""
-    episode = model.study.holdout_problem(model.terms).episodes[0]
+    episode = model.study.holdout_problem(model.model).episodes[0]
     replay, log = episode.replay, model.study.holdout[0]
     joints = replay.index.joints
     np.savez(
@@ -547,7 +548,7 @@ def plain_loss(path: Path, model: Identified, folder: Path) -> tuple[float, floa
     places = np.load(folder / "places.npy")
     (target,) = episode.targets
     white = ((target.measured - places[:, target.columns]) / target.sigma)[target.mask]
-    reported = model.study.holdout_problem(model.terms).loss(model.values[None])[0]
+    reported = model.study.holdout_problem(model.model).loss(model.model.values[None])[0]
     return float(np.sum(white**2)), float(reported)
 
 
@@ -596,7 +597,7 @@ def test_every_change_is_told_in_a_line(fitted: Any, out: Folder) -> None:
     describe_model(fitted, result, out)
     lines = change_lines(result["changes"])
     mass = next(line for line in lines if line.startswith("body KneePitch mass 0.42 -> "))
-    value = fitted.values[[p.name for m in fitted.terms for p in m.parameters].index("mass:KneePitch")]
+    value = fitted.values[fitted.model.terms.names.index("mass:KneePitch")]
     assert f"(x{value:.3f} +- " in mass
     assert not any("inertia" in line for line in lines)
     assert sum("kp" in line for line in lines) == 1
@@ -622,10 +623,10 @@ def test_a_spring_that_is_a_constant_torque_is_called_that(own: Path) -> None:
 def test_parameters_read_back_and_replay_the_same(fitted: Any, out: Folder) -> None:
     describe_model(fitted, {}, out)
     params = read_params(out.path, fitted.study.robot)
-    np.testing.assert_array_equal(params.values, fitted.values)
+    np.testing.assert_array_equal(params.model.values, fitted.values)
     assert params.numerics == fitted.study.numerics
-    again = fitted.study.train_problem(params.terms).loss(params.values[None])
-    np.testing.assert_array_equal(again, fitted.study.train_problem(fitted.terms).loss(fitted.values[None]))
+    again = fitted.study.train_problem(params.model).loss(params.model.values[None])
+    np.testing.assert_array_equal(again, fitted.study.train_problem(fitted.model).loss(fitted.values[None]))
     content = json.loads((out.path / "params.json").read_text())
     first = content["modifiers"][0]["parameters"][0]
     assert {"name", "value", "unit", "std", "ci95", "nominal"} <= set(first)
@@ -638,7 +639,7 @@ def test_effects_read_back_too(own: Path, out: Folder) -> None:
     model = model_of(study, effects, [0.02, 0.001, 0.1, 0.01, 0.02, 0.03, 1e-4])
     out.write("params.json", json.dumps(params_of(model), default=list))
     params = read_params(out.path / "params.json", robot)
-    assert [type(m) for m in params.terms] == [Backlash, Payload]
+    assert [type(m) for m in params.model.terms] == [Backlash, Payload]
     assert params.by_name["payload.mass:hip"] == 0.1
     given, unused = starts_from(params, effects[0].parameters)
     assert given == ["backlash.play:knee=0.02", "backlash.softness:knee=0.001"]
@@ -667,7 +668,7 @@ def test_what_a_log_cannot_tell_stays_nominal(own: Path) -> None:
     told = ("yes", "no")
     estimates = tuple(
         Estimate(p.name, p.unit, p.nominal, v, 0.1, (v - 0.2, v + 0.2), (p.lower, p.upper), t, False, "")  # type: ignore[arg-type]
-        for p, v, t in zip((m.parameters[0] for m in model.terms), model.values, told, strict=True)
+        for p, v, t in zip(model.model.terms.parameters, model.model.values, told, strict=True)
     )
     held = replace(model, estimates=estimates, held_back=("mass:knee",))
     made: Draft = draft(held)
@@ -678,8 +679,8 @@ def test_a_fit_that_holds_back_says_so(fitted: Any) -> None:
     blind = replace(fitted.estimates[0], identifiable="no", value=fitted.values[0])
     model = identified(replace(fitted, estimates=(blind, *fitted.estimates[1:])))
     assert model.held_back == (blind.name,)
-    assert model.written[0] == 1.0
-    np.testing.assert_array_equal(model.written[1:], fitted.values[1:])
+    assert model.written.values[0] == 1.0
+    np.testing.assert_array_equal(model.written.values[1:], fitted.values[1:])
 
 
 def test_effects_that_were_not_named_are_not_written(fitted: Any) -> None:
@@ -696,16 +697,14 @@ def test_effects_that_were_not_named_are_not_written(fitted: Any) -> None:
         candidates=(),
         steps=(),
         signature=None,
-        before_terms=fitted.terms,
-        before_values=fitted.values,
-        terms=(*fitted.terms, effect(LoadFriction, "HipPitch")),
-        values=np.append(fitted.values + 0.01, 0.2),
+        before_model=fitted.model,
+        model=fitted.model.at(fitted.values + 0.01).with_(effect(LoadFriction, "HipPitch"), [0.2]),
         replays=0,
         seconds=0.0,
     )
     model = identified(closing)
-    assert model.terms == fitted.terms
-    np.testing.assert_array_equal(model.written, fitted.values)
+    assert model.model.terms == fitted.model.terms
+    np.testing.assert_array_equal(model.written.values, fitted.values)
     assert [e.value for e in model.estimates] == list(fitted.values)
 
 

@@ -20,6 +20,7 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.run_folder import Folder
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr.btr.study import TrialStudy
@@ -44,13 +45,12 @@ class Joined:
     Attributes
     ----------
     message : in words.
-    terms, values : the model with the effects; empty where none was named.
+    model : with the effects; None where none was named.
     simulations : of beginnings of trials, that it took.
     """
 
     message: str
-    terms: tuple[Term, ...] = ()
-    values: FloatArray | tuple[float, ...] = ()
+    model: Model | None = None
     simulations: int = 0
 
 
@@ -75,25 +75,24 @@ def join_effects(
     params = None if kept is None else kept.with_name(f"{kept.stem}_params.json")
     if kept is not None and params is not None and kept.exists():
         return _read(json.loads(kept.read_text(encoding="utf-8")), params, stage.world.robot)
-    found = _look(stage, values, tried, threads, progress)
+    joined, study = _look(stage, values, tried, threads, progress)
     if kept is None or params is None:
-        return _direct(found)
+        return joined
     kept.parent.mkdir(parents=True, exist_ok=True)
     folder = Folder(kept.parent)
-    if found["params"] is not None:
+    if joined.model is not None and study is not None:
         from sysid_btr.result import to_json
+        from sysid_btr.writeback.write import Identified, params_of
 
-        folder.write(params.name, to_json(found["params"]))
-    summary = {
-        "message": found["message"],
-        "named": found["params"] is not None,
-        "simulations": found.get("simulations", 0),
-    }
+        folder.write(params.name, to_json(params_of(Identified(study, joined.model, (), ()))))
+    summary = {"message": joined.message, "named": joined.model is not None, "simulations": joined.simulations}
     folder.write(kept.name, json.dumps(summary, indent=1) + "\n")
     return _read(summary, params, stage.world.robot)
 
 
-def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int, progress: Progress) -> dict[str, Any]:
+def _look(
+    stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int, progress: Progress
+) -> tuple[Joined, TrialStudy | None]:
     """Look for effects that are the same all over the robot, with bodies as they are and drives free.
 
     Few trials of one gait tell masses or lengths from nothing else: free, they take the place of what is missing.
@@ -103,89 +102,71 @@ def _look(stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int
     from sysid_btr.diagnosis.close import close
     from sysid_btr.identify.refit import judge
     from sysid_btr.terms.library import select_effects
-    from sysid_btr.writeback.write import Identified, params_of
 
     logs = early_logs(stage, tried, LOGS)
     logs = logs[len(logs) % 2 :]  # as many fitted as held out
     if len(logs) < FEWEST:
         message = "fewer than two trials with a log of their first seconds: nothing can be looked for"
-        return {"message": message, "params": None}
-    declared = _split(stage.world.terms, values)
-    free = [m for m, _ in declared if m.scope != "body"] or [m for m, _ in declared]
-    held = tuple((m, v) for m, v in declared if m not in free)
-    start = np.array([x for m, v in declared if m in free for x in v])
+        return Joined(message), None
+    declared = Model.of(stage.world.terms, values)
+    drives = [term for term in declared.terms if term.scope != "body"] or list(declared.terms)
+    free = declared.only(*drives)
     effects = tuple(dict.fromkeys(e.name for e in select_effects(("all",)) if e.name not in SAME))
     try:
-        study = trial_study(stage, logs[::2], logs[1::2], threads, held)
-        now = judge(study, tuple(free), start)
+        study = trial_study(stage, logs[::2], logs[1::2], threads, declared.without(*drives))
+        now = judge(study, free)
         error = float(np.sqrt(max(now.train, now.holdout)))
         if error <= EXPLAINED:
             message = f"nothing is looked for: the trials begin as the model foresees within {error:.2g} noise floors"
-            return {"message": message, "params": None, "simulations": now.evaluations * len(logs)}
+            return Joined(message, simulations=now.evaluations * len(logs)), None
         closing = close(
             study,
-            free,
+            free.terms,
             effects=effects,
-            start=start,
+            start=free.values,
             alike=True,
             worth=WORTH,
             rounds=ROUNDS,
             progress=progress,
         )
     except SysidError as error:
-        return {"message": f"missing effects could not be looked for: {error}", "params": None}
-    found = _split(closing.terms, closing.values)
-    joining = found[len(free) :]
+        return Joined(f"missing effects could not be looked for: {error}"), None
     first, last = closing.steps[0].holdout, closing.steps[-1].holdout
     spent = closing.replays * len(logs)
-    if not joining or last > LEFT * first:
-        message = f"no effect is worth adding; {_score(first, last)}"
-        return {"message": message, "params": None, "simulations": spent}
-    found, last, apart = _tell_apart(study, found, len(free), last)
-    joining, spent = found[len(free) :], spent + apart * len(logs)
-    fitted = {id(m): v for m, v in found}
-    model = [*((m, fitted.get(id(m), v)) for m, v in declared), *joining]
-    terms = tuple(m for m, _ in model)
-    numbers = np.array([x for _, v in model for x in v])
-    told = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining)
-    return {
-        "message": f"joined the model: {told}; {_score(first, last)}",
-        "simulations": spent,
-        "params": params_of(Identified(study, terms, numbers, (), ())),
-        "modifiers": terms,
-        "values": numbers,
-    }
+    if len(closing.model.terms) == len(free.terms) or last > LEFT * first:
+        return Joined(f"no effect is worth adding; {_score(first, last)}", simulations=spent), None
+    found, last, apart = _tell_apart(study, closing.model, len(free.terms), last)
+    joining, spent = found.without(*free.terms), spent + apart * len(logs)
+    fitted = [(term, found.own(term) if term in found.terms else own) for term, own in declared.parts]
+    told = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
+    message = f"joined the model: {told}; {_score(first, last)}"
+    return Joined(message, Model.joined([*fitted, *joining.parts]), spent), study
 
 
-def _tell_apart(
-    study: TrialStudy, found: list[tuple[Term, tuple[float, ...]]], declared: int, left: float
-) -> tuple[list[tuple[Term, tuple[float, ...]]], float, int]:
+def _tell_apart(study: TrialStudy, found: Model, declared: int, left: float) -> tuple[Model, float, int]:
     """The model with amounts of their own at every place for effects where held-out trials want that.
 
-    `found` are terms and values, the declared ones first; `left` is the mean squared held-out error so far.
-    Returned with that of the model, and the candidates that it took.
+    The first `declared` terms stay; `left` is the mean squared held-out error so far. Returned with that of the model,
+    and the candidates that it took.
     """
     from sysid_btr.btr.map_problem import Beginnings, model_fit
     from sysid_btr.identify.refit import judge
 
     spent = 0
-    for i in range(declared, len(found)):
-        effect, values = found[i]
+    for effect in found.terms[declared:]:
         if not (isinstance(effect, Effect) and effect.shared):
             continue
-        own = _own_amounts(effect)
-        trying = [*found[:i], (own, values * len(effect.places)), *found[i + 1 :]]
-        terms = tuple(m for m, _ in trying)
-        problem = Beginnings(study.train_problem(terms, np.array([x for _, v in trying for x in v])))
+        trying = found.replaced(effect, (_own_amounts(effect), np.tile(found.own(effect), len(effect.places))))
+        problem = Beginnings(study.train_problem(trying))
         estimate = model_fit().fit(
             problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
         )
         if estimate.termination is Termination.INTERRUPTED:
             raise KeyboardInterrupt
-        judged = judge(study, terms, estimate.x, estimate.evaluations)
+        judged = judge(study, trying.at(estimate.x), estimate.evaluations)
         spent += judged.evaluations
         if judged.holdout < LEFT * left:
-            found, left = _split(terms, estimate.x), judged.holdout
+            found, left = judged.model, judged.holdout
     return found, left, spent
 
 
@@ -196,17 +177,7 @@ def _own_amounts(effect: Effect) -> Effect:
     return replace(bare, known=tuple(replace(k, name=p.name) for k, p in zip(known, bare.parameters, strict=True)))
 
 
-def _split(terms: Sequence[Term], values: FloatArray) -> list[tuple[Term, tuple[float, ...]]]:
-    """Terms with their own values."""
-    result, column = [], 0
-    for m in terms:
-        own = values[column : column + len(m.parameters)]
-        column += len(own)
-        result.append((m, tuple(float(v) for v in own)))
-    return result
-
-
-def _amounts(term: Term, values: tuple[float, ...]) -> str:
+def _amounts(term: Term, values: FloatArray) -> str:
     """Values in words: each kind's, and where it has several places their range."""
     own = np.reshape(values, (-1, len(term.kinds)))
     units = [p.unit for p in term.parameters]
@@ -221,18 +192,10 @@ def _score(before: float, after: float) -> str:
     return f"held-out position error {np.sqrt(before):.3g} -> {np.sqrt(after):.3g} noise floors"
 
 
-def _direct(found: dict[str, Any]) -> Joined:
-    if found["params"] is None:
-        return Joined(found["message"], simulations=found.get("simulations", 0))
-    values = np.asarray(found["values"])
-    return Joined(found["message"], tuple(found["modifiers"]), values, found.get("simulations", 0))
-
-
 def _read(summary: dict[str, Any], params: Path, robot: Robot) -> Joined:
     spent = int(summary.get("simulations", 0))
     if not summary["named"]:
         return Joined(summary["message"], simulations=spent)
     from sysid_btr.writeback.params import read_params
 
-    own = read_params(params, robot)
-    return Joined(summary["message"], own.terms, own.values, spent)
+    return Joined(summary["message"], read_params(params, robot).model, spent)

@@ -106,8 +106,9 @@ class Asked:
                 raise UsageError("--robot-set changes a --robot-sim; a real robot is what it is")
             return FolderExchange(self.exchange, task, space, self.model.name, patience=self.wait, say=remark)
         hidden = load_robot(str(self.robot_sim))
-        terms, truth = set_parameters(hidden, self.robot_set)
-        return HiddenRobot(make_world(hidden, task, terms, threads=1), truth, task, space, Noise(), self.seed)
+        truth = set_parameters(hidden, self.robot_set)
+        world = make_world(hidden, task, truth.terms, threads=1)
+        return HiddenRobot(world, truth.values, task, space, Noise(), self.seed)
 
 
 def run_btr(asked: Asked, out: Path | None, resume: bool, overwrite: bool) -> dict[str, Any]:

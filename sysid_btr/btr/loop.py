@@ -35,9 +35,10 @@ from sysid_btr.estimators.chain import needs_residuals
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.models.robot import Robot as Model
+from sysid_btr.models.robot import Robot as RobotModel
 from sysid_btr.objectives.distance import get_distance
 from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.terms.model import Model
 from sysid_btr.version import __version__
 
 PATIENCE = 3
@@ -224,7 +225,7 @@ class BackToReality:
 
 
 def back_to_reality(
-    model: Model,
+    model: RobotModel,
     terms: Sequence[Term],
     robot: Robot,
     space: ControllerSpace,
@@ -268,7 +269,7 @@ def back_to_reality(
 class _Loop:
     """The loop while it runs: the model so far, the trials, the rounds."""
 
-    model: Model
+    model: RobotModel
     robot: Robot
     space: ControllerSpace
     task: Walk
@@ -402,7 +403,7 @@ class _Loop:
             if not logs:
                 return None
             study = trial_study(self.stage, logs, (), self.threads)
-            asked = Beginnings(study.train_problem(self.stage.world.terms, problem.start), self._beginning)
+            asked = Beginnings(study.train_problem(Model.of(self.stage.world.terms, problem.start)), self._beginning)
         found, journal = self._search(number, step, self.settings.models, asked)
         if not np.isfinite(found.loss):
             return None
@@ -449,14 +450,10 @@ class _Loop:
         noted = _noted(self.progress, f"iteration {number}, closing")
         joined: Joined = join_effects(self.stage, values, self.book.made, kept, self.threads, noted)
         self.simulations += round(self._beginning * joined.simulations)
-        if joined.terms:
-            self.terms = joined.terms
+        if joined.model is not None:
+            self.terms = joined.model.terms
             self.stage = self._stage(self.terms)
-            self.values = np.clip(
-                joined.values,
-                [p.lower for p in self.stage.parameters],
-                [p.upper for p in self.stage.parameters],
-            )
+            self.values = joined.model.clipped().values
             self.rivals = self.values[None]
         return joined.message
 

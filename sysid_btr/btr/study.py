@@ -22,16 +22,14 @@ from sysid_btr.objectives.problem import Episode
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Outputs, Term
+from sysid_btr.terms.model import Model, Terms
 from sysid_btr.terms.scales import Scales
 
 CHANNELS = ("position",)
+PLAIN = Model.of(())
 SECONDS = 2.0
 """s, from its beginning, of a trial that is looked at. Then the base has hardly moved; later an error of it drags all
 joints along, and what a whole replay shows is chaos more and more, whatever the model."""
-
-
-Held = tuple[tuple[Term, tuple[float, ...]], ...]
-"""Terms and their values."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +38,17 @@ class TrialReplay(World):
 
     Attributes
     ----------
-    held : what is not as nominal, beside what a candidate changes.
+    fixed : what is not as nominal, beside what a candidate changes.
     """
 
-    held: Held = ()
+    fixed: Model = PLAIN
 
     @property
     def all_terms(self) -> tuple[Term, ...]:
-        return (*self.robot.always, *(m for m, _ in self.held), *self.terms)
+        return (*self.robot.always, *self.fixed.terms, *self.terms)
 
     def _values(self, candidates: FloatArray) -> list[tuple[Term, FloatArray]]:
-        fixed = [value for _, values in self.held for value in values]
-        return super()._values(np.column_stack([np.tile(fixed, (len(candidates), 1)), candidates]))
+        return super()._values(np.column_stack([np.tile(self.fixed.values, (len(candidates), 1)), candidates]))
 
     @cached_property
     def played(self) -> FloatArray:
@@ -69,10 +66,10 @@ class TrialStudy(Study):
 
     Attributes
     ----------
-    held : as of `TrialReplay`.
+    fixed : as of `TrialReplay`.
     """
 
-    held: Held = ()
+    fixed: Model = PLAIN
 
     @cached_property
     def scales(self) -> Scales:
@@ -88,28 +85,24 @@ class TrialStudy(Study):
         """That of the trials: it is cheap already."""
         return self.numerics
 
-    def settled(
-        self, terms: Sequence[Term], values: FloatArray, *, held: bool = True, anew: bool = True
-    ) -> Study:
+    def settled(self, model: Model, *, held: bool = True, anew: bool = True) -> Study:
         """As it is: where a trial began is known."""
         return self
 
     def _replay(self, log: Log, terms: Sequence[Term], *, effort: bool = False) -> TrialReplay:
         return TrialReplay(
-            self.robot, log, tuple(terms), self.numerics, effort=effort, threads=self.threads, held=self.held
+            self.robot, log, tuple(terms), self.numerics, effort=effort, threads=self.threads, fixed=self.fixed
         )
 
-    def _episode(
-        self, log: Log, terms: Sequence[Term], channels: tuple[str, ...], begin: float, end: float
-    ) -> Episode:
+    def _episode(self, log: Log, terms: Terms, channels: tuple[str, ...], begin: float) -> Episode:
         run = self._replay(log, terms)
         targets = self.with_inflation(log, make_targets(log, run.index.joints, channels, 0.0))
         time = log.time - log.time[0]
-        return Episode(run, tuple(t.window(begin, end, time) for t in targets))
+        return Episode(run, tuple(t.window(begin, np.inf, time) for t in targets))
 
 
 def trial_study(
-    stage: Stage, logs: Sequence[Log], held_out: Sequence[Log], threads: int = 0, held: Held = ()
+    stage: Stage, logs: Sequence[Log], held_out: Sequence[Log], threads: int = 0, fixed: Model = PLAIN
 ) -> TrialStudy:
     """Some trials to fit, and others to judge by.
 
@@ -118,7 +111,7 @@ def trial_study(
     stage : the model so far.
     logs, held_out : of trials; at least one each.
     threads : worker threads.
-    held : terms that stay at given values.
+    fixed : terms that stay at given values.
     """
     time = early(stage)
     return TrialStudy(
@@ -130,7 +123,7 @@ def trial_study(
         numerics=stage.world.numerics,
         numerics_error=np.nan,
         threads=threads,
-        held=held,
+        fixed=fixed,
     )
 
 

@@ -44,6 +44,7 @@ from sysid_btr.models.robot import body_names, joint_names, servo_joints
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.library import select_effects
+from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -114,11 +115,16 @@ EVEN_SPREAD = 0.05
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The model so far: `rivals` are the names that each effect may be confused with."""
+    """The model so far: its first terms are `declared`, and each effect may be confused with its `rivals`."""
 
     fitted: Fitted
-    effects: tuple[Effect, ...]
+    declared: int
     rivals: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The terms that were added."""
+        return tuple(term for term in self.fitted.model.terms[self.declared :] if isinstance(term, Effect))
 
 
 def close(
@@ -160,10 +166,10 @@ def close(
     library = usable_effects(select_effects(effects), study)
     first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
     study = replace(first.study, journal=None if journal is None else journal.section())
-    declared = first.terms
+    declared = first.model.terms
     # hypotheses are compared where each fits best
-    study, before = inflated(study, judge(study, declared, first.optimum, first.replays))
-    state = _State(before, ())
+    study, before = inflated(study, judge(study, first.model.at(first.optimum), first.replays))
+    state = _State(before, len(declared))
     steps = [StepRecord((), (), before.train, before.holdout)]
     replays = first.replays
     candidates: list[Candidate] = []
@@ -180,7 +186,7 @@ def close(
                 continue
             if len(trials) >= 3 and hypothesis.gain < HOPELESS * hypotheses[0].gain:
                 break
-            trials.append((hypothesis, _try(study, state, hypothesis)))
+            trials.append((hypothesis, _try(study, state.fitted.model, hypothesis)))
             progress(
                 done=round_number,
                 total=None,
@@ -202,7 +208,7 @@ def close(
         hypothesis, fitted = winner
         if fitted.numerics != study.numerics:
             study = replace(study, numerics=fitted.numerics)
-        hypothesis, fitted, spent = _thin(study, state, hypothesis, fitted)
+        hypothesis, fitted, spent = _thin(study, hypothesis, fitted)
         replays += spent
         rivals = tuple(
             dict.fromkeys(h.effect.name for h, f in trials if _rivals(state.fitted, winner, (h, f)))
@@ -213,39 +219,40 @@ def close(
             for e in state.effects
             if (e.label or e.name) not in hypothesis.effect.includes or not set(e.places) <= set(hypothesis.places)
         )
+        staying_rivals = tuple(r for e, r in zip(state.effects, state.rivals, strict=True) if e in staying)
         if len(staying) < len(state.effects):
-            fitted = _without(study, state, fitted, staying, hypothesis, declared)
-            keep = [i for i, e in enumerate(state.effects) if e in staying]
-            state = _State(state.fitted, staying, tuple(state.rivals[i] for i in keep))
+            gone = [e for e in state.effects if e not in staying]
+            rest = fitted.model.without(*gone, fitted.model.terms[-1])
+            fitted = refit(study, rest.with_(hypothesis.term(study.scales), hypothesis.start))
         if study.free:
-            study = study.settled(fitted.terms, fitted.values)
+            study = study.settled(fitted.model)
         study, fitted = robust_refit(study, fitted, 1)
         replays += fitted.evaluations
-        state = _State(fitted, (*state.effects, hypothesis.term(study.scales)), (*state.rivals, rivals))
+        state = _State(fitted, state.declared, (*staying_rivals, rivals))
         steps.append(StepRecord((str(hypothesis),), (), fitted.train, fitted.holdout))
-    state, removed, spent = _prune(study, state, declared)
+    state, removed, spent = _prune(study, state)
     replays += spent
     if removed:
         steps.append(StepRecord((), removed, state.fitted.train, state.fitted.holdout))
     if state.effects:
-        state = _merge(study, state, declared)
+        state = _merge(study, state)
         study = inflate(study, state.fitted, memory=True)
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="final fit")
-        polished = refit(study, state.fitted.terms, state.fitted.values, polish=True, progress=progress)
+        polished = refit(study, state.fitted.model, polish=True, progress=progress)
         replays += polished.evaluations
         state = replace(state, fitted=polished)
     final_estimates: tuple[Estimate, ...] = first.estimates
     last = state.fitted
     if not state.effects and study.free:
-        last = judge(study, declared, first.values)
+        last = judge(study, first.model)
     if state.effects:
         progress(done=MAX_ROUNDS, total=None, best=state.fitted.holdout, note="intervals")
         final_estimates, study, state, last = _estimates(study, state)
-        real = _told_apart_from_nothing(study, state, declared, final_estimates)
+        real = _told_apart_from_nothing(study, state, final_estimates)
         if real is not None:
             steps.append(StepRecord((), _named_only_in(state, real), real.fitted.train, real.fitted.holdout))
             final_estimates, study, state, last = _estimates(study, real)
-    count = sum(len(m.parameters) for m in declared)
+    count = len(declared.parameters)
     verdict = _verdict(study, before, state)
     later = later_split(study, state.fitted, _column_limit(state.fitted)) if verdict == "unexplained" else None
     if later is not None:
@@ -263,13 +270,13 @@ def close(
             alike=alike,
             rounds=rounds,
         )
-    named = _named(study, state, before, final_estimates[count:], declared, candidates) if state.effects else ()
+    named = _named(study, state, final_estimates, candidates) if state.effects else ()
     kept = named if verdict in ("explained", "ambiguous") else ()
     left = None
     if verdict == "unexplained" or (kept and _something_left(before, state.fitted)):
-        left = signature(study, state.fitted.terms, state.fitted.values)
+        left = signature(study, state.fitted.model)
     state = replace(state, fitted=last)
-    after = score(study, state.fitted.terms, state.fitted.values)
+    after = score(study, state.fitted.model)
     unit = "m" if all(s.slide for s in study.scales.values()) else "rad"
     return Closing(
         study=study,
@@ -284,34 +291,11 @@ def close(
         candidates=tuple(sorted(candidates, key=lambda c: -c.explained)),
         steps=tuple(steps),
         signature=left,
-        before_terms=declared,
-        before_values=first.values,
-        terms=state.fitted.terms,
-        values=state.fitted.values,
+        before_model=first.model,
+        model=state.fitted.model,
         replays=replays,
         seconds=perf_counter() - began,
     )
-
-
-def _without(
-    study: Study,
-    state: _State,
-    fitted: Fitted,
-    kept: tuple[Effect, ...],
-    hypothesis: Hypothesis,
-    declared: tuple[Term, ...],
-) -> Fitted:
-    """Refit with a new effect, and without those it makes superfluous."""
-    column = sum(len(m.parameters) for m in declared)
-    values = [fitted.values[:column]]
-    for effect in state.effects:
-        size = len(effect.parameters)
-        if effect in kept:
-            values.append(fitted.values[column : column + size])
-        column += size
-    values.append(hypothesis.start)
-    terms = (*declared, *kept, hypothesis.term(study.scales))
-    return refit(study, terms, np.concatenate(values))
 
 
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
@@ -336,7 +320,7 @@ def _promising(
     study: Study, state: _State, library: Sequence[type[Effect]], alike: bool
 ) -> tuple[list[Hypothesis], int]:
     """The leading hypotheses of a scan, and how many questions were answered; an interrupted run noted them."""
-    values = state.fitted.values[None]
+    values = state.fitted.model.values[None]
     places = (*joint_names(study.robot), *body_names(study.robot), "robot")
     known = None if study.journal is None else study.journal.replay("scan", values, whole=True)
     if known is not None:
@@ -354,9 +338,10 @@ def _promising(
 def _scan(
     study: Study, state: _State, library: Sequence[type[Effect]], alike: bool
 ) -> tuple[list[Trace], FloatArray]:
-    values = state.fitted.values
-    problem = shorten(study, SCAN_SECONDS).train_problem(state.fitted.terms, values)
-    residual, jacobian = linearise(problem, values, step=study.stencil(state.fitted.terms))
+    model = state.fitted.model
+    values = model.values
+    problem = shorten(study, SCAN_SECONDS).train_problem(model)
+    residual, jacobian = linearise(problem, values, step=study.stencil(model.terms))
     places = {
         "joint": joint_names(study.robot),
         "servo": servo_joints(study.robot),
@@ -377,8 +362,8 @@ def _scan(
         if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
     ]
     if study.free and len(asked) > GLANCED:
-        glance = shorten(study, GLANCE_SECONDS).train_problem(state.fitted.terms, values)
-        linear = linearise(glance, values, step=study.stencil(glance.terms))
+        glance = shorten(study, GLANCE_SECONDS).train_problem(model)
+        linear = linearise(glance, values, step=study.stencil(model.terms))
         seen = scan(glance, values, *linear, asked, study.scales)
         asked = [t.question for t in seen[:GLANCED]]
     # what is left is the right integrator's; what an effect would change may be a little off
@@ -392,18 +377,16 @@ def _scan(
     return traces, residual
 
 
-def _try(
-    study: Study, state: _State, hypothesis: Hypothesis, values: FloatArray | None = None
-) -> Fitted:
-    terms = (*state.fitted.terms, hypothesis.term(study.scales))
-    rest = state.fitted.values if values is None else values
+def _try(study: Study, rest: Model, hypothesis: Hypothesis) -> Fitted:
+    """The model with a hypothesis added, refitted."""
     ladder = hypothesis.ladder()
-    starts = np.column_stack([np.tile(rest, (len(ladder), 1)), ladder])
+    terms = rest.with_(hypothesis.term(study.scales), ladder[0]).terms
+    starts = np.column_stack([np.tile(rest.values, (len(ladder), 1)), ladder])
     seconds = REFIT_SECONDS if len(starts) <= FEW_STARTS else LADDER_SECONDS
     spent = 0
     while True:
         start = best_start(shorten(study, seconds), terms, starts)
-        found = refit(shorten(study, REFIT_SECONDS), terms, start, judged=study)
+        found = refit(shorten(study, REFIT_SECONDS), Model(terms, start), judged=study)
         spent += found.evaluations + len(starts)
         finer = study.numerics.halved()
         given_up = study.free or finer.integrator == "Euler" or finer.timestep < FINEST
@@ -440,10 +423,8 @@ def _something_left(before: Fitted, now: Fitted) -> bool:
     return bool(np.any((now.columns > _column_limit(now)) & (now.columns - 1 > REST * (before.columns - 1))))
 
 
-def _thin(
-    study: Study, state: _State, hypothesis: Hypothesis, fitted: Fitted
-) -> tuple[Hypothesis, Fitted, int]:
-    """Drop places of a group whose small amounts held-out data do not miss."""
+def _thin(study: Study, hypothesis: Hypothesis, fitted: Fitted) -> tuple[Hypothesis, Fitted, int]:
+    """Drop places of a group, the model's last term, whose small amounts held-out data do not miss."""
     spent = 0
     kinds = len(hypothesis.effect.kinds)
     main = hypothesis.effect.main
@@ -452,7 +433,8 @@ def _thin(
     waiting = True
     while waiting and not hypothesis.shared and 1 < len(hypothesis.places) <= MOST_THINNED:
         waiting = False
-        amounts = fitted.values[-hypothesis.size :].reshape(-1, kinds)
+        group = fitted.model.terms[-1]
+        amounts = fitted.model.own(group).reshape(-1, kinds)
         size = np.abs(amounts[:, main] - neutral)
         least = int(np.argmin(size))
         if size[least] > SMALL * size.max():
@@ -463,7 +445,7 @@ def _thin(
             places=tuple(hypothesis.places[i] for i in rest),
             start=amounts[rest].ravel(),
         )
-        trial = _try(study, state, smaller, fitted.values[: -hypothesis.size])
+        trial = _try(study, fitted.model.without(group), smaller)
         spent += trial.evaluations
         loss = trial.misfit_everywhere - fitted.misfit_everywhere if once else trial.misfit - fitted.misfit
         if size[least] <= IDLE * size.max() or loss <= SIMPLER:
@@ -601,30 +583,24 @@ def _candidates(
                 if o.effect.name != h.effect.name and gain > 0 and abs(g.misfit - f.misfit) < NEAR
             )
         )
-        amplitude = float(f.values[len(f.values) - h.size + h.effect.main])
+        amplitude = float(f.model.own(f.model.terms[-1])[h.effect.main])
         result.append(Candidate(h.effect.name, h.places, gain, amplitude, same))
     return result
 
 
-def _prune(
-    study: Study, state: _State, declared: tuple[Term, ...]
-) -> tuple[_State, tuple[str, ...], int]:
+def _prune(study: Study, state: _State) -> tuple[_State, tuple[str, ...], int]:
     """Backward pass: drop effects without which held-out data are predicted as well."""
     removed: list[str] = []
     spent = 0
-    offset = sum(len(m.parameters) for m in declared)
     for effect in state.effects[:-1] if len(state.effects) > 1 else ():
         at = state.effects.index(effect)
-        others = state.effects[:at] + state.effects[at + 1 :]
-        first = offset + sum(len(e.parameters) for e in state.effects[:at])
-        values = np.delete(state.fitted.values, slice(first, first + len(effect.parameters)))
-        trial = refit(shorten(study, REFIT_SECONDS), (*declared, *others), values, judged=study)
+        trial = refit(shorten(study, REFIT_SECONDS), state.fitted.model.without(effect), judged=study)
         spent += trial.evaluations
         if not (_accepted(trial, state.fitted) or _accepted_wholly(trial, state.fitted)):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
-            state = _State(trial, others, state.rivals[:at] + state.rivals[at + 1 :])
+            state = _State(trial, state.declared, state.rivals[:at] + state.rivals[at + 1 :])
     for effect in state.effects if len(state.effects) > 1 else ():
-        thinner, dropped, cost = _thin_again(study, state, effect, declared)
+        thinner, dropped, cost = _thin_again(study, state, effect)
         spent += cost
         if dropped:
             state = thinner
@@ -632,57 +608,42 @@ def _prune(
     return state, tuple(removed), spent
 
 
-def _thin_again(
-    study: Study, state: _State, effect: Effect, declared: tuple[Term, ...]
-) -> tuple[_State, tuple[str, ...], int]:
+def _thin_again(study: Study, state: _State, effect: Effect) -> tuple[_State, tuple[str, ...], int]:
     """Drop places of an effect that were in demand only until a later effect was found."""
     if effect.shared:
         return state, (), 0
     at = state.effects.index(effect)
-    others = state.effects[:at] + state.effects[at + 1 :]
-    first = sum(len(m.parameters) for m in (*declared, *state.effects[:at]))
-    own = slice(first, first + len(effect.parameters))
-    values = np.delete(state.fitted.values, own)
-    rest = replace(state.fitted, terms=(*declared, *others), values=values)
-    amounts = state.fitted.values[own]
+    amounts = state.fitted.model.own(effect)
     whole = Hypothesis(type(effect), effect.places, False, amounts, 0.0)
-    now = replace(
-        state.fitted, terms=(*rest.terms, effect), values=np.concatenate([values, amounts])
-    )
-    left, fitted, spent = _thin(study, _State(rest, others), whole, now)
+    now = replace(state.fitted, model=state.fitted.model.without(effect).with_(effect, amounts))
+    left, fitted, spent = _thin(study, whole, now)
     rivals = (*state.rivals[:at], *state.rivals[at + 1 :], state.rivals[at])
     dropped = tuple(p for p in effect.places if p not in left.places)
-    return _State(fitted, (*others, left.term(study.scales)), rivals), dropped, spent
+    return _State(fitted, state.declared, rivals), dropped, spent
 
 
-def _merge(study: Study, state: _State, declared: tuple[Term, ...]) -> _State:
+def _merge(study: Study, state: _State) -> _State:
     """Effects of one kind found in several rounds become one; amounts that agree become one amount."""
-    offset = sum(len(m.parameters) for m in declared)
     pieces: dict[type[Effect], list[tuple[str, FloatArray]]] = {}
     confused: dict[type[Effect], tuple[str, ...]] = {}
-    column = offset
     for effect, rivals in zip(state.effects, state.rivals, strict=True):
-        size = len(effect.parameters)
-        amounts = effect.spread(state.fitted.values[None, column : column + size])[0]
+        amounts = effect.spread(state.fitted.model.own(effect)[None])[0]
         pieces.setdefault(type(effect), []).extend(zip(effect.places, amounts, strict=True))
         confused[type(effect)] = tuple(dict.fromkeys((*confused.get(type(effect), ()), *rivals)))
-        column += size
-    merged: list[Effect] = []
-    values = [state.fitted.values[:offset]]
+    model = state.fitted.model.without(*state.effects)
     for kind, found in pieces.items():
         places = tuple(p for p, _ in found)
         amounts = np.array([a for _, a in found])
         main = amounts[:, kind.main]
         middle = float(np.median(main))
         even = len(found) > 2 and bool(np.all(np.abs(main - middle) <= EVEN_SPREAD * abs(middle)))
-        values.append(np.median(amounts, axis=0) if even else amounts.ravel())
-        merged.append(kind.at(places, study.scales, shared=even).around(values[-1]))
-    terms = (*declared, *merged)
-    fitted = replace(state.fitted, terms=terms, values=np.concatenate(values))
+        values = np.median(amounts, axis=0) if even else amounts.ravel()
+        model = model.with_(kind.at(places, study.scales, shared=even).around(values), values)
+    fitted = replace(state.fitted, model=model)
     # what is in the model beside an effect is not its rival
     present = {kind.name for kind in pieces}
     kept = tuple(tuple(name for name in names if name not in present) for names in confused.values())
-    return _State(fitted, tuple(merged), kept)
+    return _State(fitted, state.declared, kept)
 
 
 def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study, _State, Fitted]:
@@ -692,48 +653,42 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
     also where the motion of walks tells more than these do.
     """
     for refinement in range(MAX_REFINEMENTS + 1):
-        fitted = state.fitted
-        problem = study.train_problem(fitted.terms, fitted.values)
+        model = state.fitted.model
+        problem = study.train_problem(model)
         if refinement == 0:
-            residual, jacobian = linearise(problem, fitted.values, step=study.stencil(fitted.terms))
+            residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
             jacobian = np.nan_to_num(jacobian)
         else:  # what half the step changes in the derivatives is far less than what is known of them
-            residual = problem.residuals(fitted.values[None])[0]
-        shift, known = numerics_shift(problem, fitted.values, jacobian, residual), None
+            residual = problem.residuals(model.values[None])[0]
+        shift, known = numerics_shift(problem, model.values, jacobian, residual), None
         if study.free:
-            weighed = weigh_walks(study, problem, fitted.values, jacobian, residual)
+            weighed = weigh_walks(study, problem, model.values, jacobian, residual)
             jacobian, residual = weighed.jacobian, weighed.residual
             shift, known = np.hypot(shift, weighed.error), weighed.known
-            fitted = replace(fitted, values=weighed.values)
-        found = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks, shift, known)
-        bare = estimates(problem.parameters, fitted.values, jacobian, residual, problem.blocks)
+            model = model.at(weighed.values)
+        found = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks, shift, known)
+        bare = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks)
         told = np.array([e.identifiable != "no" for e in bare])
         worst = np.max(np.abs(shift[told]) / np.maximum([e.std for e in bare], 1e-300)[told], initial=0.0)
         settled = worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or study.free
         if settled or refinement == MAX_REFINEMENTS:
             break
         study = replace(study, numerics=study.numerics.halved())
-        state = replace(state, fitted=refit(study, fitted.terms, fitted.values, iterations=4))
-    values, found, _ = hold_unidentifiable(problem, fitted.values, found, jacobian, known)
-    last = judge(study, fitted.terms, values)
+        state = replace(state, fitted=refit(study, model, iterations=4))
+    values, found, _ = hold_unidentifiable(problem, model.values, found, jacobian, known)
+    last = judge(study, model.at(values))
     return found, study, replace(state, fitted=last) if known is None else state, last
 
 
-def _told_apart_from_nothing(
-    study: Study, state: _State, declared: tuple[Term, ...], found: Sequence[Estimate]
-) -> _State | None:
+def _told_apart_from_nothing(study: Study, state: _State, found: Sequence[Estimate]) -> _State | None:
     """The model without effects, and places of effects, whose amounts may be nothing; None where there are none.
 
     Only what held-out data do not miss is dropped: of two effects that a log tells together but not apart, one stays.
     """
-    offset = sum(len(m.parameters) for m in declared)
     doubtful: list[tuple[float, Effect, list[int]]] = []
-    column = offset
     for effect in state.effects:
-        size, kinds = len(effect.parameters), len(effect.kinds)
-        pairs = zip(
-            found[column + effect.main : column + size : kinds], effect.neutral[effect.main :: kinds], strict=True
-        )
+        own, main = found[state.fitted.model.terms.columns(effect)], slice(effect.main, None, len(effect.kinds))
+        pairs = zip(own[main], effect.neutral[main], strict=True)
         sure = [
             0.0 if e.identifiable == "no" else abs(e.value - n) / max(e.std, 1e-300)
             if e.ci95[0] <= n <= e.ci95[1]
@@ -743,27 +698,22 @@ def _told_apart_from_nothing(
         kept = [i for i, s in enumerate(sure) if np.isinf(s)]
         if len(kept) < len(sure):
             doubtful.append((min(sure), effect, kept))
-        column += size
     result: _State | None = None
     now = state
     for _, effect, kept in sorted(doubtful, key=lambda item: item[0]):
         if not kept and len(now.effects) == 1:
             break
         at = now.effects.index(effect)
-        first = offset + sum(len(e.parameters) for e in now.effects[:at])
-        own = now.fitted.values[first : first + len(effect.parameters)].reshape(-1, len(effect.kinds))
+        amounts = now.fitted.model.own(effect).reshape(-1, len(effect.kinds))[kept].ravel()
         left: tuple[Effect, ...] = ()
         if kept:
             places = [effect.places[i] for i in kept]
-            left = (type(effect).at(places, study.scales).around(own[kept].ravel()),)
-        effects = (*now.effects[:at], *left, *now.effects[at + 1 :])
-        values = np.concatenate(
-            [now.fitted.values[:first], own[kept].ravel(), now.fitted.values[first + own.size :]]
-        )
-        fitted = refit(study, (*declared, *effects), values, polish=True)
+            left = (type(effect).at(places, study.scales).around(amounts),)
+        model = now.fitted.model.replaced(effect, *((e, amounts) for e in left))
+        fitted = refit(study, model, polish=True)
         if fitted.misfit <= state.fitted.misfit + NEAR:
             rivals = (*now.rivals[:at], *((now.rivals[at],) if left else ()), *now.rivals[at + 1 :])
-            result = now = _State(fitted, effects, rivals)
+            result = now = _State(fitted, now.declared, rivals)
     return result
 
 
@@ -786,21 +736,15 @@ def _verdict(study: Study, before: Fitted, state: _State) -> Verdict:
 
 
 def _named(
-    study: Study,
-    state: _State,
-    before: Fitted,
-    found: Sequence[Estimate],
-    declared: tuple[Term, ...],
-    candidates: Sequence[Candidate],
+    study: Study, state: _State, found: Sequence[Estimate], candidates: Sequence[Candidate]
 ) -> tuple[NamedEffect, ...]:
-    result, column = [], 0
-    offset = sum(len(m.parameters) for m in declared)
+    result, model = [], state.fitted.model
     for effect, confused in zip(state.effects, state.rivals, strict=True):
-        size = len(effect.parameters)
-        own = tuple(found[column : column + size])
-        without = state.fitted.values.copy()
-        without[offset + column : offset + column + size] = effect.neutral
-        off = judge(study, state.fitted.terms, without)
+        columns = model.terms.columns(effect)
+        own = tuple(found[columns])
+        without = model.values.copy()
+        without[columns] = effect.neutral
+        off = judge(study, model.at(without))
         gain = (off.holdout - state.fitted.holdout) / max(off.holdout, 1e-12)
         confused = (*confused, *(n for n in _alike(effect, candidates) if n not in confused))
         result.append(
@@ -814,7 +758,6 @@ def _named(
                 sentence=sentence_of(effect, own),
             )
         )
-        column += size
     return tuple(result)
 
 

@@ -10,7 +10,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Model
 
 Verdict = Literal["explained", "nothing_missing", "ambiguous", "unexplained"]
 
@@ -83,7 +83,7 @@ class Closing:
     candidates : what was weighed, best first.
     steps : every step of the way.
     signature : of the residual that is left, when unexplained or where effects that are named leave much of it.
-    terms, values : the final model.
+    before_model, model : with the declared parameters fitted, and with what was missing.
     replays, seconds : cost.
     """
 
@@ -99,12 +99,15 @@ class Closing:
     candidates: tuple[Candidate, ...]
     steps: tuple[StepRecord, ...]
     signature: Mapping[str, Any] | None
-    before_terms: tuple[Term, ...]
-    before_values: FloatArray
-    terms: tuple[Term, ...]
-    values: FloatArray
+    before_model: Model
+    model: Model
     replays: int
     seconds: float
+
+    @property
+    def values(self) -> FloatArray:
+        """(p,) values of all parameters of the final model."""
+        return self.model.values
 
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import result_html

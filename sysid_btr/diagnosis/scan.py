@@ -14,8 +14,8 @@ import numpy as np
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.subtrees import WHOLE_ROBOT
-from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect, Probe, middle_scale, scale_at
+from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import Scales
 
 FAINT = 1e-4
@@ -184,18 +184,15 @@ def _ask(
 ) -> list[Trace]:
     """Simulate questions that share a set of terms."""
     where = problem.where
-    extra: list[Term] = []
-    offset: dict[tuple[type[Effect], str], int] = {}
-    column = len(values)
+    model, columns = Model(problem.terms, values), {}
     for effect in dict.fromkeys(q.effect for q in asked):
         places = tuple(dict.fromkeys(p for q in asked if q.effect is effect for p in q.places))
         term = effect.at(places, scales)
+        first = len(model.values)
         for i, place in enumerate(places):
-            offset[effect, place] = column + i * len(effect.kinds)
-        column += len(term.parameters)
-        extra.append(term)
-    wide = problem.with_terms((*problem.terms, *extra), values)
-    neutral = np.concatenate([values, *(m.neutral for m in extra if isinstance(m, Effect))])
+            columns[effect, place] = slice(first + i * len(effect.kinds), first + (i + 1) * len(effect.kinds))
+        model = model.with_(term, term.neutral)
+    wide, neutral = problem.with_model(model), model.values
     # one simulation carries one direction of one question in each subtree
     lanes: dict[int, list[tuple[int, int]]] = {}
     for i, question in enumerate(asked):
@@ -210,8 +207,7 @@ def _ask(
         for i, d in job:
             question = asked[i]
             for place in question.places:
-                at = offset[question.effect, place]
-                candidates[row, at : at + len(question.effect.kinds)] = question.probe[d]
+                candidates[row, columns[question.effect, place]] = question.probe[d]
     subtree_of_row = wide._subtrees[1]
     responses: dict[tuple[int, int], FloatArray | None] = {}
     rows_of = {subtree: np.flatnonzero(subtree_of_row == subtree) for subtree in lanes}
@@ -231,9 +227,9 @@ def _ask(
     whole = _Part(everywhere, basis, rest)
     traces = []
     for i, question in enumerate(asked):
-        columns = [responses[i, d] for d in range(len(question.probe))]
-        known = [c for c in columns if c is not None]
-        if len(known) < len(columns):
+        seen = [responses[i, d] for d in range(len(question.probe))]
+        known = [c for c in seen if c is not None]
+        if len(known) < len(seen):
             continue
         part = parts.get(_subtree(question, where), whole)
         trace = _judge(question, part, np.column_stack(known), least, scales)

@@ -19,7 +19,6 @@ from sysid_btr.diagnosis.signal_features import Line, Train, hats, predicted_sha
 from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.terms.base import Term
 from sysid_btr.terms.cogging import Cogging
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.external_disturbance import (
@@ -27,6 +26,7 @@ from sysid_btr.terms.external_disturbance import (
     ExternalDisturbance,
     ExternalDisturbanceTrain,
 )
+from sysid_btr.terms.model import Model
 
 LOUD = 1.3
 """Chi2 of a joint's position from which its error is looked at."""
@@ -108,12 +108,9 @@ def proposals(
 
 def _within_train(problem: ReplayProblem, values: FloatArray, joint: str, start: float, duration: float) -> bool:
     """Whether a pulse is at the time of one of those that the model already has at this joint."""
-    column = 0
-    for term in problem.terms:
-        own = values[None, column : column + len(term.parameters)]
-        column += len(term.parameters)
+    for term, own in problem.terms.split(values):
         if isinstance(term, ExternalDisturbanceTrain) and joint in term.places:
-            _, first, long, period = term.spread(own)[0, term.places.index(joint)]
+            _, first, long, period = term.spread(own[None])[0, term.places.index(joint)]
             # since the train's pulse that began last before this one ends
             if (start + duration - first) % period < duration + long:
                 return True
@@ -235,13 +232,13 @@ def _rhythm_of_motion(one: MissingTorque, period: float) -> bool:
     return signal_features.repetition(one.velocity, one.time, period) > OWN_RHYTHM
 
 
-def signature(study: Study, terms: Sequence[Term], values: FloatArray) -> dict[str, Any]:
+def signature(study: Study, model: Model) -> dict[str, Any]:
     """Describe what a model leaves of the training data, as missing torque at the joints.
 
     Parameters
     ----------
     study : robot and logs.
-    terms, values : the model, (p,).
+    model : what is left is what this does not explain.
 
     Returns
     -------
@@ -251,7 +248,7 @@ def signature(study: Study, terms: Sequence[Term], values: FloatArray) -> dict[s
         ``periodic`` or None, and ``dependence``: the share of the missing torque that is predicted from a
         state of the robot on stretches of time left out (a correlation ratio free of the bias of its bins).
     """
-    torques = missing_torques(study.train_problem(terms), values, study.scales)
+    torques = missing_torques(study.train_problem(model), model.values, study.scales)
     if not torques:
         why = "its base was free, and windows are too short" if study.free else "the replay fails or is too short"
         return {"summary": f"not characterised: {why}", "joints": []}

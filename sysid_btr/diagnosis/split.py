@@ -42,8 +42,8 @@ def later_split(study: Study, fitted: Fitted, limit: FloatArray) -> Study | None
     above = np.maximum(fitted.holdout_columns - 1, 0.0)
     if above[hidden].sum() < MOSTLY * above.sum() or not hidden.any():
         return None
-    problem = study.holdout_problem(fitted.terms)
-    residual = problem.residuals(fitted.values[None])[0]
+    problem = study.holdout_problem(fitted.model)
+    residual = problem.residuals(fitted.model.values[None])[0]
     scale = np.array([t.sigma[k] / t.noise[k] for _, t, k in problem.columns])[problem.column_labels]
     excess = np.where(hidden[problem.column_labels], (residual * scale) ** 2 - 1, 0.0)
     by_block = np.bincount(problem.blocks, np.nan_to_num(excess))

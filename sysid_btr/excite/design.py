@@ -28,7 +28,7 @@ from sysid_btr.estimators.registry import get_estimator
 from sysid_btr.excite.motion import MARGIN, Clock, Family, as_log, find_motors
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, estimates
 from sysid_btr.identify.numerics import choose_numerics
-from sysid_btr.identify.study import measure_scales, nominal_start
+from sysid_btr.identify.study import measure_scales
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.split import split_episodes
 from sysid_btr.models.robot import Robot
@@ -37,8 +37,9 @@ from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.terms.base import Parameter
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Terms
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -232,7 +233,7 @@ class Experiment:
     """
 
     robot: Robot
-    terms: tuple[Term, ...]
+    terms: Terms
     sensors: Sensors
     numerics: Numerics
     threads: int
@@ -250,7 +251,7 @@ class Experiment:
             threads=self.threads,
         )
         targets = self.sensors.targets(log.time, replay.index.joints)
-        return ReplayProblem((Episode(replay, targets),), nominal_start(self.terms))
+        return ReplayProblem((Episode(replay, targets),), self.terms.nominal)
 
     def of_reference(self, log: Log, seconds: float) -> ReplayProblem:
         """The problem that a reference log poses, as far as `seconds` of it."""
@@ -271,7 +272,7 @@ class Experiment:
             )
             targets = self.sensors.targets(part.time - part.time[0], replay.index.joints)
             episodes.append(Episode(replay, targets))
-        return ReplayProblem(tuple(episodes), nominal_start(self.terms))
+        return ReplayProblem(tuple(episodes), self.terms.nominal)
 
 
 def prepare(robot: Robot, parameters: Sequence[str], sensors: Sensors, log: Log, *, threads: int = 0) -> Experiment:
@@ -287,7 +288,7 @@ def prepare(robot: Robot, parameters: Sequence[str], sensors: Sensors, log: Log,
     replay = Replay(robot, held, (), numerics, threads=threads)
     last = replay.predict(np.zeros((1, 0))).position[0, -1]
     rest = dict(zip(replay.index.joints, map(float, last), strict=True))
-    terms = parse_parameters(parameters, robot, measure_scales(robot, (log,), numerics, threads))
+    terms = Terms(parse_parameters(parameters, robot, measure_scales(robot, (log,), numerics, threads)))
     return Experiment(robot, terms, sensors, numerics, threads, rest)
 
 

@@ -27,6 +27,7 @@ from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Terms
 
 if TYPE_CHECKING:
     import mujoco
@@ -271,9 +272,9 @@ def choose_window(robot: Robot, walk: Walk, numerics: Numerics, threads: int = 0
     because less of it goes into their starts, until errors of the model and of the starts have grown over it. Both
     are measured, on a few windows spread over the walk, for all masses and the common gains.
     """
-    terms = parse_parameters(["mass:*", *(f"{g}:*=shared" for g in ("kp", "kv") if servo_joints(robot))], robot)
-    values = np.array([p.nominal for m in terms for p in m.parameters])
-    step = np.array([p.scale for m in terms for p in m.parameters])
+    gains = (f"{g}:*=shared" for g in ("kp", "kv") if servo_joints(robot))
+    terms = Terms(parse_parameters(["mass:*", *gains], robot))
+    values, step = terms.nominal, terms.scale
     found: list[tuple[float, FloatArray, float]] = []
     for seconds in LENGTHS:
         try:

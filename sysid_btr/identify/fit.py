@@ -22,11 +22,12 @@ from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, Profile, es
 from sysid_btr.identify.numerics import held_numerics
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
-from sysid_btr.identify.study import Study, nominal_start
+from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import RANK, Known, newton
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
 from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Model, Terms
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -52,22 +53,21 @@ class Fit:
     Attributes
     ----------
     study : as fitted; its numerics may have been refined.
-    terms : whose parameters were fitted.
+    model : terms whose parameters were fitted, at the estimates' values.
     estimates : one a parameter.
-    values : (p,) the estimates' values.
     nominal, before : scores of the plain and of the fitted model on fitted and held-out data.
     result : what the estimator returned.
     numerics_shift : (p,) change of the estimates when the step is halved; on walks with the error of `weigh_walks`.
     replays : candidates simulated.
     seconds : wall time.
-    optimum : (p,) `values`, but for walks whose motion tells more than replays do: there, where residuals are least.
+    optimum : (p,) the model's values, but for walks whose motion tells more than replays do: there, where residuals
+        are least.
     profiles : likelihood along single parameters, where it was asked for (`identify.profile`).
     """
 
     study: Study
-    terms: tuple[Term, ...]
+    model: Model
     estimates: tuple[Estimate, ...]
-    values: FloatArray
     nominal: Scores
     before: Scores
     result: FitResult
@@ -76,6 +76,11 @@ class Fit:
     seconds: float
     optimum: FloatArray
     profiles: tuple[Profile, ...] = ()
+
+    @property
+    def values(self) -> FloatArray:
+        """(p,) the estimates' values."""
+        return self.model.values
 
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import result_html
@@ -121,14 +126,15 @@ def fit(
     """
     began = perf_counter()
     terms = as_terms(study, parameters)
+    model = Model.of(terms, start)
     estimator = LeastSquares() if estimator is None else estimator
     if study.free and isinstance(estimator, LeastSquares):
         estimator = walking(estimator)
     rng = np.random.default_rng(0) if rng is None else rng
     journal = Journal() if journal is None else journal
-    if any(m.parameters for m in terms):
-        study = realise_servo(study, terms, start)
-    problem = study.train_problem(terms, start)
+    if terms.parameters:
+        study = realise_servo(study, model)
+    problem = study.train_problem(model)
     if not problem.parameters:
         raise UsageError("nothing to fit: free at least one parameter, for example --fit 'mass:*'")
     rough, budget = 0, budget or Budget()
@@ -140,19 +146,19 @@ def fit(
         if isinstance(estimator, LeastSquares):
             rough, estimator = explored.evaluations, walking(estimator) if study.free else estimator
         journal = journal.section()
-        problem = study.train_problem(terms, explored.x)
+        problem = study.train_problem(model.at(explored.x))
     if isinstance(estimator, LeastSquares):
         # first find how large each column's error is, then weigh the columns by it
         if study.free:
-            study, coarse = settled_refit(study, terms, problem.start)
+            study, coarse = settled_refit(study, model.at(problem.start))
         else:
-            coarse = refit(study, terms, problem.start)
+            coarse = refit(study, model.at(problem.start))
         if float(coarse.train_columns.max()) > MISFIT:
             if not study.free:  # windows are weighed one by one already
                 study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
             study = inflate(study, coarse, memory=True)
         rough += coarse.evaluations
-        problem = study.train_problem(terms, coarse.values)
+        problem = study.train_problem(coarse.model)
     if distance is not None and isinstance(estimator, LeastSquares):
         raise UsageError("lsq minimises squared residuals: for another distance choose ga, cmaes or nlopt:ALGORITHM")
     if study.free and isinstance(estimator, LeastSquares):
@@ -176,7 +182,7 @@ def fit(
         if study.free or not isinstance(estimator, LeastSquares) or worst <= SHIFT_TOLERATED or digital or misfit > FAR:
             break
         study = replace(study, numerics=study.numerics.halved())
-        problem = study.train_problem(terms, values)
+        problem = study.train_problem(model.at(values))
         polished = LeastSquares().fit(
             problem, rng=rng, budget=Budget(), journal=Journal(), progress=progress
         )
@@ -194,11 +200,10 @@ def fit(
         values, found, extra = hold_unidentifiable(problem, values, found, jacobian, known)
     return Fit(
         study=study,
-        terms=terms,
+        model=model.at(values),
         estimates=found,
-        values=values,
-        nominal=score(study, terms, nominal_start(terms)),
-        before=score(study, terms, values),
+        nominal=score(study, Model.of(terms)),
+        before=score(study, model.at(values)),
         result=result,
         numerics_shift=shift,
         replays=replays + extra,
@@ -207,7 +212,7 @@ def fit(
     )
 
 
-def realise_servo(study: Study, terms: tuple[Term, ...], start: FloatArray | None) -> Study:
+def realise_servo(study: Study, model: Model) -> Study:
     """The study with the realisation of a digital servo that fits the log better.
 
     Held torque under a known velocity, or an Euler step a period, which is a velocity from differences.
@@ -218,35 +223,34 @@ def realise_servo(study: Study, terms: tuple[Term, ...], start: FloatArray | Non
     if held is None:
         return study
     short = shorten(study, SERVO_SECONDS)
-    first = nominal_start(terms) if start is None else start
     misfit = [
-        float(np.mean(np.log(refit(replace(short, numerics=n), terms, first, iterations=4).train_columns)))
+        float(np.mean(np.log(refit(replace(short, numerics=n), model, iterations=4).train_columns)))
         for n in (held, study.numerics)
     ]
     return replace(study, numerics=held) if misfit[0] < misfit[1] - SERVO_MARGIN else study
 
 
-def settled_refit(study: Study, terms: tuple[Term, ...], start: FloatArray) -> tuple[Study, Fitted]:
+def settled_refit(study: Study, model: Model) -> tuple[Study, Fitted]:
     """First fit of walks: parameters, and starts of windows, in turn, with a cheap integrator."""
     numerics = study.numerics
     study = replace(study, numerics=study.rough)
-    first = best_start(study, terms, contact_starts(terms, start))
-    coarse = refit(study, terms, first, iterations=5)
-    study = study.settled(terms, coarse.values, held=False, anew=False)
-    again = refit(study, terms, coarse.values, iterations=3)
-    study = replace(study.settled(terms, again.values), numerics=numerics)
+    first = best_start(study, model.terms, contact_starts(model))
+    coarse = refit(study, model.at(first), iterations=5)
+    study = study.settled(coarse.model, held=False, anew=False)
+    again = refit(study, coarse.model, iterations=3)
+    study = replace(study.settled(again.model), numerics=numerics)
     spent = again.evaluations + coarse.evaluations
     if all(isinstance(log, Walk) for log in study.train):
-        return study, judge(study, terms, again.values, spent)
+        return study, judge(study, again.model, spent)
     # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model
-    right = refit(study, terms, again.values)
+    right = refit(study, again.model)
     return study, replace(right, evaluations=right.evaluations + spent)
 
 
-def contact_starts(terms: tuple[Term, ...], start: FloatArray) -> FloatArray:
+def contact_starts(model: Model) -> FloatArray:
     """Starts (k, p) that differ in how stiff the ground is: between a soft and a hard one the loss is not convex."""
-    own = [i for i, p in enumerate(p for m in terms for p in m.parameters) if p.name.startswith("foot_compliance")]
-    starts = np.tile(start, (1 + len(STIFFER) * bool(own), 1))
+    own = [i for i, name in enumerate(model.terms.names) if name.startswith("foot_compliance")]
+    starts = np.tile(model.values, (1 + len(STIFFER) * bool(own), 1))
     for row, factor in zip(starts[1:], STIFFER, strict=False):
         row[own] *= factor
     return starts
@@ -256,10 +260,10 @@ STIFFER = (0.6, 0.35, 0.25)
 """Contact time constants tried first, as factors of the nominal."""
 
 
-def as_terms(study: Study, parameters: Sequence[str] | Sequence[Term]) -> tuple[Term, ...]:
+def as_terms(study: Study, parameters: Sequence[str] | Sequence[Term]) -> Terms:
     """Expressions of the grammar as terms; terms as they are."""
-    given = tuple(p for p in parameters if isinstance(p, Term))
-    return (*given, *study.declare([p for p in parameters if isinstance(p, str)]))
+    given = (p for p in parameters if isinstance(p, Term))
+    return Terms((*given, *study.declare([p for p in parameters if isinstance(p, str)])))
 
 
 def before_chi2(problem: ReplayProblem, residual: FloatArray) -> float:

@@ -14,7 +14,7 @@ from sysid_btr.identify.deferred import corrected
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import RANK, Known, covariance, newton
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Model
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def weigh_walks(
     follow : whether the estimates may; else all logs count by their noise. What another estimator or distance has found
         stays where it is.
     """
-    walked, moved = walked_residuals(problem), _placed_elsewhere(study, problem.terms, values)
+    walked, moved = walked_residuals(problem), _placed_elsewhere(study, Model(problem.terms, values))
     if moved is None:
         return Weighed(values, jacobian, residual, np.full(len(values), np.inf))
     there, residual_there, walked_there = moved
@@ -182,14 +182,15 @@ def _noise_of(jacobian: FloatArray, rows: BoolArray) -> FloatArray:
 
 
 def _placed_elsewhere(
-    study: Study, terms: tuple[Term, ...], values: FloatArray
+    study: Study, model: Model
 ) -> tuple[FloatArray, FloatArray, BoolArray] | None:
     """Jacobian (r, p), residual (r,) and which of it is of walks, where windows begin elsewhere; None if that fails.
 
     In the right model the change of the estimates is a part of the noise; in another it is the least that the model's
     error does.
     """
-    relaid = study.relaid().settled(terms, values, held=False)
-    problem = relaid.train_problem(terms, values)
-    residual, jacobian = linearise(corrected(problem, study.rough, values), values, step=study.stencil(terms))
+    relaid = study.relaid().settled(model, held=False)
+    problem = relaid.train_problem(model)
+    rough = corrected(problem, study.rough, model.values)
+    residual, jacobian = linearise(rough, model.values, step=study.stencil(model.terms))
     return (jacobian, residual, walked_residuals(problem)) if np.isfinite(jacobian).all() else None

@@ -52,11 +52,11 @@ def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = s
     UsageError
         `name` is not free; the message lists what is.
     """
-    parameters = [p for m in fit.terms for p in m.parameters]
+    parameters = fit.model.terms.parameters
     names = [p.name for p in parameters]
     if name not in names:
         raise UsageError(f"--profile {name} is not a free parameter; there are {', '.join(names)}")
-    problem = fit.study.train_problem(fit.terms, fit.values)
+    problem = fit.study.train_problem(fit.model)
     index = names.index(name)
     return profile_curve(
         problem,

@@ -17,7 +17,7 @@ from sysid_btr.identify.study import WIDE_STEP, Study
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Model, Terms
 
 CORRELATED = 1.5
 """Chi2 of a column beyond which its residual is an error of the model rather than noise."""
@@ -33,7 +33,7 @@ class Fitted:
 
     Attributes
     ----------
-    terms, values : the model.
+    model : terms and their values.
     train, holdout : mean square of error over noise floor.
     train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
     memory : integrated autocorrelation, in samples, of each column's fitted residual; 1 if white.
@@ -44,8 +44,7 @@ class Fitted:
     numerics : with which it was judged.
     """
 
-    terms: tuple[Term, ...]
-    values: FloatArray
+    model: Model
     train: float
     holdout: float
     train_columns: FloatArray
@@ -79,15 +78,14 @@ class Fitted:
 
 def refit(
     study: Study,
-    terms: tuple[Term, ...],
-    start: FloatArray,
+    model: Model,
     *,
     polish: bool = False,
     iterations: int = 8,
     progress: Progress = silent,
     judged: Study | None = None,
 ) -> Fitted:
-    """Least squares from a first guess; `polish` runs to convergence with central differences.
+    """Least squares that begin at a model; `polish` runs to convergence with central differences.
 
     `judged` is the study whose data say how good the result is, where that is not the one that is fitted.
 
@@ -96,24 +94,24 @@ def refit(
     KeyboardInterrupt
         The user interrupted; the study's journal, if it has one, holds what was simulated, except to polish.
     """
-    problem = study.train_problem(terms, np.clip(start, *_bounds(terms)))
+    problem = study.train_problem(model.clipped())
     estimator = LeastSquares(
         confirm=polish,
         max_iterations=30 if polish else iterations,
         tolerance=1e-6 if polish else 2e-4,
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
-    structural = any(m.structural for m in terms)
+    structural = model.terms.structural
     if study.free:
         estimator = walking(estimator)
     elif structural:
-        step = study.stencil(terms)
+        step = study.stencil(model.terms)
         estimator = replace(estimator, forward_step=step, central_step=step)
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
     # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
-    costly = structural or any(type(m).overrides("law") for m in terms)
+    costly = structural or model.terms.have_laws
     cheaper = study.free or not (polish or costly)
     if cheaper and study.numerics != study.cheap:
         result = deferred_fit(
@@ -123,15 +121,15 @@ def refit(
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
     if result.termination is Termination.INTERRUPTED:
         raise KeyboardInterrupt
-    return judge(judged or study, terms, result.x, evaluations=result.evaluations)
+    return judge(judged or study, model.at(result.x), evaluations=result.evaluations)
 
 
-def best_start(study: Study, terms: tuple[Term, ...], starts: FloatArray) -> FloatArray:
+def best_start(study: Study, terms: Terms, starts: FloatArray) -> FloatArray:
     """The best (p,) of several first guesses (k, p); the first, unless another one is better by more than a trace."""
-    starts = np.clip(starts, *_bounds(terms))
+    starts = np.clip(starts, terms.lower, terms.upper)
     if len(starts) == 1:
         return np.asarray(starts[0])
-    problem = study.train_problem(terms, starts[0])
+    problem = study.train_problem(Model(terms, starts[0]))
     try:
         losses = Evaluator(problem, budget=Budget(), journal=study.section(), progress=silent).loss(starts)
     except Stop:
@@ -161,17 +159,16 @@ def walking(estimator: LeastSquares) -> LeastSquares:
     )
 
 
-def judge(study: Study, terms: tuple[Term, ...], values: FloatArray, evaluations: int = 0) -> Fitted:
-    """Scores of given values on fitted and held-out data."""
-    train = study.train_problem(terms)
-    holdout = study.holdout_problem(terms)
-    r, s = of_both(train, holdout, lambda problem: np.asarray(problem.residuals(values[None])[0]))
+def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:
+    """Scores of a model on fitted and held-out data."""
+    train = study.train_problem(model)
+    holdout = study.holdout_problem(model)
+    r, s = of_both(train, holdout, lambda problem: np.asarray(problem.residuals(model.values[None])[0]))
     train_columns, holdout_columns = _by_column(train, r), _by_column(holdout, s)
     a, b = _counts(train), _counts(holdout)
     same = len(a) == len(b)
     return Fitted(
-        terms=terms,
-        values=values,
+        model=model,
         train=float(np.average(train_columns, weights=a)),
         holdout=float(np.average(holdout_columns, weights=b)),
         train_columns=train_columns,
@@ -197,7 +194,7 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     means: Geyer 1992, doi:10.1214/ss/1177011137), which is right for estimates under an error that stays, and
     wrong for finding its cause.
     """
-    problem = study.train_problem(fitted.terms)
+    problem = study.train_problem(fitted.model)
     worst: dict[tuple[str, str, str], float] = {}
     for chi2, length, (i, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
         key = (problem.episodes[i].replay.log.meta.mount, target.channel, target.joints[k])
@@ -212,7 +209,7 @@ def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitt
     for _ in range(rounds):
         before = fitted.train_columns
         study = inflate(study, fitted)
-        again = refit(study, fitted.terms, fitted.values)
+        again = refit(study, fitted.model)
         fitted = replace(again, evaluations=again.evaluations + fitted.evaluations)
         # held-out data must not decide how long is fitted
         if np.all(np.abs(np.log(fitted.train_columns / before)) < 0.02):
@@ -225,7 +222,7 @@ def inflated(study: Study, fitted: Fitted) -> tuple[Study, Fitted]:
     study = inflate(study, fitted)
     if not study.free:  # scores are in noise floors; only starts of windows take up more where columns count less
         return study, fitted
-    return study, judge(study, fitted.terms, fitted.values, fitted.evaluations)
+    return study, judge(study, fitted.model, fitted.evaluations)
 
 
 def _counts(problem: ReplayProblem) -> FloatArray:
@@ -264,11 +261,6 @@ def _by_cell(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     square = np.nan_to_num(residual, nan=1e6) ** 2 * factor[columns]
     sums = np.bincount(columns * width + blocks, square, len(problem.columns) * width)
     return np.asarray(sums.reshape(-1, width), dtype=np.float64)
-
-
-def _bounds(terms: tuple[Term, ...]) -> tuple[FloatArray, FloatArray]:
-    parameters = [p for m in terms for p in m.parameters]
-    return np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
 
 
 def paired_t(better: Fitted, worse: Fitted) -> float:

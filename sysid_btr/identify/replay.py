@@ -13,8 +13,8 @@ from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.split import split_episodes
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def replay_log(
     robot: Robot,
     log: Log,
-    parameters: Mapping[str, float] | tuple[tuple[Term, ...], FloatArray] | None = None,
+    parameters: Mapping[str, float] | Model | None = None,
     *,
     numerics: Numerics | None = None,
     threads: int = 0,
@@ -37,7 +37,7 @@ def replay_log(
     robot : the model.
     log : commands, times and initial state; each episode starts anew.
     parameters : expression of the grammar -> value, for example ``{"mass:*Knee*": 1.1, "kp:*": 0.9}``; or
-        terms with their values.
+        a model.
     numerics : integrator and step; None chooses by a convergence check on the log.
     threads : worker threads, 0 for all cores.
 
@@ -52,15 +52,13 @@ def replay_log(
     UsageError
         A parameter that the model does not have, or a value that is not finite.
     """
-    terms, values = (
-        parameters if isinstance(parameters, tuple) else set_parameters(robot, parameters or {})
-    )
+    model = parameters if isinstance(parameters, Model) else set_parameters(robot, parameters or {})
     episodes = split_episodes(log)
     chosen = choose_numerics(robot.for_log(log), episodes[0], threads)[0] if numerics is None else numerics
     parts: dict[str, list[FloatArray]] = {}
     for episode in episodes:
-        run = Replay(robot.for_log(episode), episode, terms, chosen, effort=True, threads=threads)
-        outputs = run.predict(values[None])
+        run = Replay(robot.for_log(episode), episode, model.terms, chosen, effort=True, threads=threads)
+        outputs = run.predict(model.values[None])
         for i, joint in enumerate(run.index.joints):
             parts.setdefault(f"position.{joint}", []).append(outputs.position[0, :, i])
             parts.setdefault(f"velocity.{joint}", []).append(outputs.velocity[0, :, i])
@@ -82,8 +80,8 @@ def replay_log(
     )
 
 
-def set_parameters(robot: Robot, parameters: Mapping[str, float]) -> tuple[tuple[Term, ...], FloatArray]:
-    """Terms that hold parameters at given values, and these values in order, (p,).
+def set_parameters(robot: Robot, parameters: Mapping[str, float]) -> Model:
+    """The model with parameters at given values.
 
     Raises
     ------
@@ -93,14 +91,6 @@ def set_parameters(robot: Robot, parameters: Mapping[str, float]) -> tuple[tuple
     wrong = [f"{name}={value}" for name, value in parameters.items() if not np.isfinite(value)]
     if wrong:
         raise UsageError(f"values must be finite numbers, not {', '.join(wrong)}")
-    terms: list[Term] = []
-    values: list[float] = []
-    for term, value in _declared(robot, parameters):
-        terms.append(term)
-        values += [value] * len(term.parameters)
-    return tuple(terms), np.array(values, dtype=np.float64)
-
-
-def _declared(robot: Robot, parameters: Mapping[str, float]) -> list[tuple[Term, float]]:
     parse_parameters(list(parameters), robot)  # all problems at once, places freed twice among them
-    return [(m, value) for name, value in parameters.items() for m in parse_parameters([name], robot)]
+    declared = [(term, value) for name, value in parameters.items() for term in parse_parameters([name], robot)]
+    return Model.joined((term, [value] * len(term.parameters)) for term, value in declared)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.objectives.targets import COMPARED
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
@@ -45,13 +45,13 @@ class Scores:
     holdout: Mapping[str, ChannelScore]
 
 
-def score(study: Study, terms: Sequence[Term], values: FloatArray) -> Scores:
-    """Score one candidate on every channel that log and model have, fitted or not."""
+def score(study: Study, model: Model) -> Scores:
+    """Score a model on every channel that log and model have, fitted or not."""
     from dataclasses import replace
 
     wide = replace(study, channels=COMPARED)
-    fitted, heldout = wide.train_problem(terms), wide.holdout_problem(terms)
-    errors = of_both(fitted, heldout, lambda problem: problem.errors(values))
+    fitted, heldout = wide.train_problem(model), wide.holdout_problem(model)
+    errors = of_both(fitted, heldout, lambda problem: problem.errors(model.values))
     return Scores(*(_scores(problem, own) for problem, own in zip((fitted, heldout), errors, strict=True)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -35,6 +35,7 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Model, Terms, as_model
 from sysid_btr.terms.scales import JointScale, Scales
 
 TINY = 1e-9
@@ -83,32 +84,26 @@ class Study:
         """Sizes of torques and motions at every joint in the plain model on these logs."""
         return measure_scales(self.robot, self.train, self.numerics, self.threads)
 
-    def declare(self, expressions: Sequence[str]) -> tuple[Term, ...]:
+    def declare(self, expressions: Sequence[str]) -> Terms:
         """Terms of the parameters that a user frees."""
-        return parse_parameters(expressions, self.robot, self.scales)
+        return Terms(parse_parameters(expressions, self.robot, self.scales))
 
-    def train_problem(self, terms: Sequence[Term], start: FloatArray | None = None) -> ReplayProblem:
-        """What is fitted."""
-        episodes = tuple(
-            self._episode(log, terms, self.channels, 0.0, self.train_stop(log)) for log in self.train
-        )
-        begin = nominal_start(terms) if start is None else start
-        return ReplayProblem(episodes, begin, self.executor)
+    def train_problem(self, model: Model | Iterable[Term]) -> ReplayProblem:
+        """What is fitted, by a search that begins at a model; bare terms begin at their nominal values."""
+        model = as_model(model)
+        episodes = tuple(self._episode(log, model.terms, self.channels, 0.0) for log in self.train)
+        return ReplayProblem(episodes, model.values, self.executor)
 
-    def holdout_problem(self, terms: Sequence[Term]) -> ReplayProblem:
+    def holdout_problem(self, model: Model | Iterable[Term]) -> ReplayProblem:
         """What is predicted without having been fitted."""
+        model = as_model(model)
         episodes = tuple(
-            self._episode(log, terms, self.channels, begin, np.inf)
+            self._episode(log, model.terms, self.channels, begin)
             for log, begin in zip(self.holdout, self.split, strict=True)
         )
-        return ReplayProblem(episodes, nominal_start(terms), self.executor)
+        return ReplayProblem(episodes, model.values, self.executor)
 
-    def train_stop(self, log: Log) -> float:
-        return np.inf
-
-    def _episode(
-        self, log: Log, terms: Sequence[Term], channels: tuple[str, ...], begin: float, end: float
-    ) -> Episode:
+    def _episode(self, log: Log, terms: Terms, channels: tuple[str, ...], begin: float) -> Episode:
         robot = self.robot.for_log(log)
         present = tuple(c for c in channels if any(log.has(c, j) for j in joint_names(robot)))
         if isinstance(log, Walk):
@@ -120,9 +115,9 @@ class Study:
         if not targets:
             raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
         targets = self.with_inflation(log, targets)
-        if begin > 0 or np.isfinite(end):
+        if begin > 0:
             time = log.time - log.time[0]
-            targets = tuple(t.window(begin, end, time) for t in targets)
+            targets = tuple(t.window(begin, np.inf, time) for t in targets)
         if isinstance(log, Walk):
             inside = covered(log)[:, None]
             targets = tuple(replace(t, mask=t.mask & inside) for t in targets)
@@ -169,15 +164,13 @@ class Study:
             ),
         )
 
-    def stencil(self, terms: Sequence[Term]) -> float:
+    def stencil(self, terms: Terms) -> float:
         """Finite-difference step, fraction of a parameter's range: wide where impacts roughen the objective."""
         if self.free:
             return WIDE_STEP
-        return ROUGH_STEP if any(m.structural for m in terms) else LeastSquares.central_step
+        return ROUGH_STEP if terms.structural else LeastSquares.central_step
 
-    def settled(
-        self, terms: Sequence[Term], values: FloatArray, *, held: bool = True, anew: bool = True
-    ) -> Study:
+    def settled(self, model: Model, *, held: bool = True, anew: bool = True) -> Study:
         """The study with the starts of its windows moved to where the data want them under these parameters.
 
         `held` says whether those of held-out windows too, which only judge; `anew` whether known derivatives with
@@ -187,8 +180,8 @@ class Study:
             if not isinstance(log, Walk):
                 return log
             log = log.only(begin)
-            episode = self._episode(log, terms, self.channels, begin, np.inf)
-            return settle(log, episode.replay, episode.targets, values, self.rough, anew=anew)
+            episode = self._episode(log, model.terms, self.channels, begin)
+            return settle(log, episode.replay, episode.targets, model.values, self.rough, anew=anew)
 
         return replace(
             self,
@@ -197,11 +190,6 @@ class Study:
             if held
             else self.holdout,
         )
-
-
-def nominal_start(terms: Sequence[Term]) -> FloatArray:
-    """Nominal values of all parameters of some terms."""
-    return np.array([p.nominal for m in terms for p in m.parameters])
 
 
 def make_study(
@@ -271,7 +259,7 @@ def make_study(
             numerics, error = choose_numerics(robot, study.train[0], threads)
         study = replace(study, numerics_error=error)
     study = replace(study, numerics=numerics)
-    return study.settled((), np.zeros(0)) if study.free else study
+    return study.settled(Model.of(())) if study.free else study
 
 
 def _ready(robot: Robot, episode: Log) -> Log:

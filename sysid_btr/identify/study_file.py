@@ -18,6 +18,7 @@ from sysid_btr.models.robot import Robot, joint_names, servo_actuators
 from sysid_btr.objectives.noise import NoiseFloor, noise_floor
 from sysid_btr.objectives.targets import COMPARED, FITTED
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Terms
 from sysid_btr.units import si
 
 if TYPE_CHECKING:
@@ -203,9 +204,9 @@ def _parameters(robot: Robot, model: mujoco.MjModel, moving: Sequence[str], free
     yield ""
     yield "# Between which values each parameter is sought, by name or for a whole field."
     yield "[bounds]"
-    terms = parse_parameters([expression for expression, _ in chosen], robot)
+    terms = Terms(parse_parameters([expression for expression, _ in chosen], robot))
     shown = {}
-    for parameter in (p for m in terms for p in m.parameters):
+    for parameter in terms.parameters:
         shown[parameter.name.partition(":")[0]] = (parameter.lower, parameter.upper)
     for field, (low, high) in shown.items():
         yield f"# {_text(field)} = [{low:g}, {high:g}]"

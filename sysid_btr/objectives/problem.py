@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -18,7 +18,8 @@ from sysid_btr.simulation.batching import batched_chunks, group_replays
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.subtrees import column_groups, parameter_subtrees, subtrees
-from sysid_btr.terms.base import Outputs, Parameter, Term
+from sysid_btr.terms.base import Outputs, Parameter
+from sysid_btr.terms.model import Model, Terms
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,29 +102,34 @@ class ReplayProblem:
         return {"episodes": self.episodes, "start": self.start}
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return self.episodes[0].replay.parameters
+    def model(self) -> Model:
+        """The terms where a search begins."""
+        return Model(self.terms, self.start)
+
+    @cached_property
+    def terms(self) -> Terms:
+        return Terms(self.episodes[0].replay.terms)
 
     @property
-    def terms(self) -> tuple[Term, ...]:
-        return self.episodes[0].replay.terms
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.terms.parameters
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(p.name for p in self.parameters)
+        return self.terms.names
 
     @cached_property
     def lower(self) -> FloatArray:
-        return np.array([p.lower for p in self.parameters])
+        return self.terms.lower
 
     @cached_property
     def upper(self) -> FloatArray:
-        return np.array([p.upper for p in self.parameters])
+        return self.terms.upper
 
     @cached_property
     def scale(self) -> FloatArray:
         """(p,) size of a change that matters."""
-        return np.array([p.scale for p in self.parameters])
+        return self.terms.scale
 
     @cached_property
     def count(self) -> int:
@@ -262,10 +268,10 @@ class ReplayProblem:
         own = acts_on[parameter]
         return np.isin(subtree, list(own)) if own else None
 
-    def with_terms(self, terms: Sequence[Term], start: FloatArray) -> ReplayProblem:
-        """The same data under another set of terms."""
-        episodes = tuple(replace(e, replay=replace(e.replay, terms=tuple(terms))) for e in self.episodes)
-        return ReplayProblem(episodes, start, self.executor)
+    def with_model(self, model: Model) -> ReplayProblem:
+        """The same data under another set of terms, and a search that begins at other values."""
+        episodes = tuple(replace(e, replay=replace(e.replay, terms=model.terms)) for e in self.episodes)
+        return ReplayProblem(episodes, model.values, self.executor)
 
     def with_numerics(self, numerics: Numerics) -> ReplayProblem:
         """The same problem under another integrator or step."""

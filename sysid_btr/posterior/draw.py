@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
     from sysid_btr.identify.study import Study
-    from sysid_btr.terms.base import Parameter
 
 BUDGET = Budget(evaluations=20_000)
 """Where nothing is said."""
@@ -78,7 +77,7 @@ class Posterior:
     @property
     def as_fit(self) -> Fit:
         """The model of the posterior means, where a fit is asked for."""
-        return replace(self.fit, values=self.values, estimates=self.estimates, before=self.after)
+        return replace(self.fit, model=self.fit.model.at(self.values), estimates=self.estimates, before=self.after)
 
     @property
     def converged(self) -> bool:
@@ -88,9 +87,8 @@ class Posterior:
     @property
     def learnt(self) -> FloatArray:
         """(p,) posterior over prior standard deviation: 1 where the log says nothing."""
-        prior = [
-            moments(prior, p.lower, p.upper)[1] for prior, p in zip(self.priors, _parameters(self.fit), strict=True)
-        ]
+        pairs = zip(self.priors, self.fit.model.terms.parameters, strict=True)
+        prior = [moments(prior, p.lower, p.upper)[1] for prior, p in pairs]
         return np.asarray(np.array([e.std for e in self.estimates]) / np.array(prior))
 
 
@@ -130,10 +128,10 @@ def posterior(
         The budget ends before there is a draw.
     """
     began = perf_counter()
-    parameters = _parameters(fit)
+    parameters = fit.model.terms.parameters
     chosen = choose_priors(parameters, priors or {}, fit.study.robot.priors)
-    problem = fit.study.train_problem(fit.terms, fit.values)
-    x, residual, jacobian, extra = settle(problem, fit.values, fit.study.stencil(fit.terms))
+    problem = fit.study.train_problem(fit.model)
+    x, residual, jacobian, extra = settle(problem, fit.model.values, fit.study.stencil(fit.model.terms))
     likelihood = make_likelihood(problem, x, residual, jacobian, problem.blocks, fit.numerics_shift)
     drawn = sample(
         replace(problem, start=x),
@@ -146,7 +144,7 @@ def posterior(
         progress=progress,
     )
     values = drawn.flat.mean(axis=0)
-    bands = predict_bands(fit.study, fit.terms, drawn.thinned(PREDICTIVE_DRAWS), values)
+    bands = predict_bands(fit.study, fit.model.at(values), drawn.thinned(PREDICTIVE_DRAWS))
     return Posterior(
         fit=fit,
         priors=chosen,
@@ -154,7 +152,7 @@ def posterior(
         sample=drawn,
         estimates=_estimates(fit, drawn, jacobian),
         values=values,
-        after=score(fit.study, fit.terms, values),
+        after=score(fit.study, fit.model.at(values)),
         bands=bands,
         coverage=coverage(bands),
         replays=fit.replays + extra + drawn.evaluations + PREDICTIVE_DRAWS,
@@ -162,13 +160,9 @@ def posterior(
     )
 
 
-def _parameters(fit: Fit) -> tuple[Parameter, ...]:
-    return tuple(p for m in fit.terms for p in m.parameters)
-
-
 def _estimates(fit: Fit, drawn: Sample, jacobian: FloatArray) -> tuple[Estimate, ...]:
     flat = drawn.flat
-    parameters = _parameters(fit)
+    parameters = fit.model.terms.parameters
     mean, std = flat.mean(axis=0), flat.std(axis=0)
     low, high = np.quantile(flat, [0.025, 0.975], axis=0)
     covariance = np.atleast_2d(np.cov(flat.T))

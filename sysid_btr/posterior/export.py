@@ -76,7 +76,7 @@ def to_datatree(posterior: Posterior) -> Any:
     for group in ("posterior", "sample_stats"):
         tree[group] = tree[group].to_dataset().assign_coords(ensemble=("chain", member))
     found = drawn.convergence
-    parameters = [p for m in posterior.fit.terms for p in m.parameters]
+    parameters = posterior.fit.model.terms.parameters
     for j, (name, parameter, prior) in enumerate(zip(names, parameters, posterior.priors, strict=True)):
         tree["posterior"][name].attrs.update(
             {

@@ -14,7 +14,7 @@ from sysid_btr.units import CHANNEL_UNITS
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
     from sysid_btr.objectives.problem import ReplayProblem
-    from sysid_btr.terms.base import Term
+    from sysid_btr.terms.model import Model
 
 WIDTH = 1.959963984540054
 """Standard deviations of a 95 % band."""
@@ -63,21 +63,19 @@ class Band:
         return float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
 
 
-def predict_bands(
-    study: Study, terms: Sequence[Term], draws: FloatArray, values: FloatArray
-) -> tuple[Band, ...]:
+def predict_bands(study: Study, model: Model, draws: FloatArray) -> tuple[Band, ...]:
     """Bands of every fitted sensor on every held-out episode.
 
     Parameters
     ----------
-    study, terms : as fitted.
+    study : as fitted.
+    model : whose error on the fitted data is taken for that of its predictions.
     draws : (m, p) of the posterior; those that diverge are left out.
-    values : (p,) at which the fitted model's error is measured.
     """
-    error = _fitted_error(study.train_problem(terms), values)
+    error = _fitted_error(study.train_problem(model), model.values)
     bands = []
     several = len(study.holdout) > 1
-    for log, episode in zip(study.holdout, study.holdout_problem(terms).episodes, strict=True):
+    for log, episode in zip(study.holdout, study.holdout_problem(model).episodes, strict=True):
         sums = [np.zeros((3, *t.mask.shape)) for t in episode.targets]
         for _, outputs in episode.replay.chunks(draws):
             for total, target in zip(sums, episode.targets, strict=True):

@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.report.style import FOUND, MODEL_COLOURS, PLAIN, SHADE, faint, ink, new_figure, on_page
+from sysid_btr.terms.model import Model
 from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
-    from sysid_btr.terms.base import Term
+
 
 JOINTS_SHOWN = 3
 EPISODES_SEARCHED = 8
@@ -68,8 +69,8 @@ class Trace:
         return float(np.sqrt(np.mean(residual**2)) / self.noise) if len(residual) else 0.0
 
 
-Named = tuple[str, tuple["Term", ...], FloatArray]
-"""A model to draw: its name, its terms and their values."""
+Named = tuple[str, Model]
+"""A model to draw, and what it is called."""
 
 
 def trace_outcome(outcome: Fit | Closing) -> tuple[Trace, ...]:
@@ -79,21 +80,13 @@ def trace_outcome(outcome: Fit | Closing) -> tuple[Trace, ...]:
     those where the fitted parameters still are.
     """
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.identify.study import nominal_start
 
     if isinstance(outcome, Fit):
-        start = nominal_start(outcome.terms)
-        models: tuple[Named, ...] = (
-            ("plain model", outcome.terms, start),
-            ("fitted", outcome.terms, outcome.values),
-        )
+        models: tuple[Named, ...] = (("plain model", Model.of(outcome.model.terms)), ("fitted", outcome.model))
         return trace(outcome.study, models, "plain model")
-    models = (
-        ("plain model", (), np.zeros(0)),
-        ("parameters fitted", outcome.before_terms, outcome.before_values),
-    )
+    models = (("plain model", Model.of(())), ("parameters fitted", outcome.before_model))
     if outcome.effects:
-        models = (*models, ("effects added", outcome.terms, outcome.values))
+        models = (*models, ("effects added", outcome.model))
     return trace(outcome.study, models, "parameters fitted")
 
 
@@ -103,9 +96,9 @@ def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, .
     several = len(study.holdout) > 1
     count = min(len(study.holdout), EPISODES_SEARCHED)
     predicted: list[dict[str, FloatArray]] = [{} for _ in range(count)]
-    for name, terms, values in models:
-        for i, episode in enumerate(study.holdout_problem(terms).episodes[:count]):
-            predicted[i][name] = episode.replay.predict(values[None]).position[0]
+    for name, model in models:
+        for i, episode in enumerate(study.holdout_problem(model).episodes[:count]):
+            predicted[i][name] = episode.replay.predict(model.values[None]).position[0]
     plain = study.holdout_problem(())
     for i, episode in enumerate(plain.episodes[:count]):
         log, joints = study.holdout[i], episode.replay.index.joints

@@ -16,6 +16,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     import mujoco
@@ -129,8 +130,8 @@ def scene_of(outcome: Fit | Closing) -> Scene:
         robot = study.robot.for_log(log)
         model = compile_model(robot, log, (Backdrop(places=()),), study.numerics)
         index = make_index(model)
-        before = _predicted(study, (), np.zeros(0), i)
-        after = _predicted(study, final.terms, final.values, i)
+        before = _predicted(study, Model.of(()), i)
+        after = _predicted(study, final.model, i)
         logged = np.column_stack(
             [_filled(log.channels.get(f"position.{j}"), after[:, k]) for k, j in enumerate(index.joints)]
         )
@@ -146,10 +147,10 @@ def scene_of(outcome: Fit | Closing) -> Scene:
     return best
 
 
-def _predicted(study: Study, terms: Sequence[Term], values: FloatArray, episode: int) -> FloatArray:
+def _predicted(study: Study, model: Model, episode: int) -> FloatArray:
     """Positions (n, joints) of one held-out episode under a model; bridged where it is not predicted."""
-    replay = study.holdout_problem(terms).episodes[episode].replay
-    found = replay.predict(values[None]).position[0]
+    replay = study.holdout_problem(model).episodes[episode].replay
+    found = replay.predict(model.values[None]).position[0]
     return np.column_stack([_filled(column, np.zeros(len(column))) for column in found.T])
 
 

@@ -9,12 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-import numpy as np
-
-from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.run_folder import PARAMS
 from sysid_btr.terms.base import Parameter, Scope, Term
+from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr.models.robot import Robot
@@ -29,19 +27,17 @@ class Params:
 
     Attributes
     ----------
-    terms, values : the model, effects included.
+    model : effects included.
     numerics : with which it was replayed.
     """
 
-    terms: tuple[Term, ...]
-    values: FloatArray
+    model: Model
     numerics: Numerics
 
     @property
     def by_name(self) -> dict[str, float]:
         """Parameter name -> value."""
-        names = (p.name for m in self.terms for p in m.parameters)
-        return dict(zip(names, (float(v) for v in self.values), strict=True))
+        return dict(zip(self.model.terms.names, (float(v) for v in self.model.values), strict=True))
 
 
 def read_params(path: Path, robot: Robot) -> Params:
@@ -64,15 +60,13 @@ def read_params(path: Path, robot: Robot) -> Params:
     if not isinstance(content, dict) or content.get("schema") != PARAMS_SCHEMA:
         raise UsageError(f"--params {file} is no parameter file ({PARAMS_SCHEMA}); give the params.json of a run")
     problems: list[str] = []
-    terms: list[Term] = []
-    values: list[float] = []
+    parts: list[tuple[Term, list[float]]] = []
     try:
         places = {scope: robot.names(scope) for scope in get_args(Scope)}
         for entry in content["modifiers"]:
-            term = _modifier(entry, places, problems, robot)
+            term = _term(entry, places, problems, robot)
             if term is not None:
-                terms.append(term)
-                values += [float(p["value"]) for p in entry["parameters"]]
+                parts.append((term, [float(p["value"]) for p in entry["parameters"]]))
         numerics = Numerics(str(content["numerics"]["integrator"]), float(content["numerics"]["timestep"]))
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(
@@ -80,10 +74,10 @@ def read_params(path: Path, robot: Robot) -> Params:
         ) from error
     if problems:
         raise UsageError(f"--params {file}:\n" + "\n".join(f"  {p}" for p in problems))
-    return Params(tuple(terms), np.array(values), numerics)
+    return Params(Model.joined(parts), numerics)
 
 
-def _modifier(
+def _term(
     entry: Mapping[str, Any], places: Mapping[str, Sequence[str]], problems: list[str], robot: Robot
 ) -> Term | None:
     from sysid_btr.terms.fields import FIELDS

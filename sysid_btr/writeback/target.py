@@ -13,7 +13,8 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.silence import silenced
-from sysid_btr.terms.base import BatchModel, Term
+from sysid_btr.terms.base import BatchModel
+from sysid_btr.terms.model import Model
 from sysid_btr.writeback.features import WRITTEN
 from sysid_btr.writeback.native import Part, part_of
 
@@ -39,18 +40,15 @@ class Target:
     fields: tuple[frozenset[str], ...]
 
 
-def make_parts(robot: Robot, terms: Sequence[Term], values: FloatArray, numerics: Numerics) -> tuple[Part, ...]:
+def make_parts(robot: Robot, model: Model, numerics: Numerics) -> tuple[Part, ...]:
     """How a file holds each term that is not neutral; those of the robot itself come first."""
-    everything = (*robot.always, *terms)
-    parts, column = [], 0
-    for i, term in enumerate(everything):
-        count = len(term.parameters)
-        own = values[column : column + count]
-        column += count
-        neutral = count > 0 and np.array_equal(own, [p.nominal for p in term.parameters])
+    everything = Model.joined([*((term, ()) for term in robot.always), *model.parts])
+    parts = []
+    for i, (term, own) in enumerate(everything.parts):
+        neutral = len(own) > 0 and np.array_equal(own, [p.nominal for p in term.parameters])
         if neutral and not type(term).overrides("edit_spec"):
             continue
-        parts.append(part_of(term, term.spread(own[None]), numerics, everything[i + 1 :]))
+        parts.append(part_of(term, term.spread(own[None]), numerics, everything.terms[i + 1 :]))
     return tuple(parts)
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError, SysidError
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import Study
@@ -19,6 +18,7 @@ from sysid_btr.result import clean, model_entry, to_json
 from sysid_btr.run_folder import MODEL, PARAMS, Folder
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.model import Model
 from sysid_btr.version import __version__
 from sysid_btr.writeback.changes import SOLVER, Change, changes_of, describe
 from sysid_btr.writeback.features import Kind
@@ -47,26 +47,27 @@ class Identified:
     Attributes
     ----------
     study : robot, logs, numerics.
-    terms, values : the model.
+    model : the terms and their values.
     estimates : of its parameters, in order.
     held_back : names of parameters that the log cannot tell and that stay at their nominal value although the
         search had moved them.
     """
 
     study: Study
-    terms: tuple[Term, ...]
-    values: FloatArray
+    model: Model
     estimates: tuple[Estimate, ...]
     held_back: tuple[str, ...]
 
     @property
-    def written(self) -> FloatArray:
-        """(p,) values as they are written."""
+    def written(self) -> Model:
+        """The model as it is written."""
         known = {e.name: e for e in self.estimates}
-        names = [p.name for m in self.terms for p in m.parameters]
-        return np.array(
-            [known[n].nominal if n in self.held_back else v for n, v in zip(names, self.values, strict=True)]
-        )
+        pairs = zip(self.model.terms.names, self.model.values, strict=True)
+        return self.model.at(np.array([known[n].nominal if n in self.held_back else v for n, v in pairs]))
+
+    def estimates_of(self, term: Term) -> tuple[Estimate, ...]:
+        """Estimates of a term's own parameters; none of a term that is not in the model, or where there are none."""
+        return self.estimates[self.model.terms.columns(term)] if term in self.model.terms else ()
 
 
 def identified(outcome: Fit | Closing) -> Identified:
@@ -74,20 +75,21 @@ def identified(outcome: Fit | Closing) -> Identified:
     from sysid_btr.identify.fit import Fit
 
     if isinstance(outcome, Fit):
-        terms, values, estimates = outcome.terms, outcome.values, outcome.estimates
+        model, estimates = outcome.model, outcome.estimates
     elif outcome.effects:
-        terms, values = outcome.terms, outcome.values
+        model = outcome.model
         estimates = (*outcome.parameters, *(p for e in outcome.effects for p in e.parameters))
     else:
-        terms, values = outcome.before_terms, outcome.before_values
-        estimates = tuple(replace(e, value=float(v)) for e, v in zip(outcome.parameters, values, strict=True))
-    declared = sum(len(m.parameters) for m in terms if not isinstance(m, Effect))
+        model = outcome.before_model
+        estimates = tuple(replace(e, value=float(v)) for e, v in zip(outcome.parameters, model.values, strict=True))
     held_back = tuple(
         e.name
-        for e, v in zip(estimates[:declared], values[:declared], strict=True)
+        for term in model.terms
+        if not isinstance(term, Effect)
+        for e, v in zip(estimates[model.terms.columns(term)], model.own(term), strict=True)
         if e.identifiable == "no" and v != e.nominal
     )
-    return Identified(outcome.study, tuple(terms), np.asarray(values), estimates, held_back)
+    return Identified(outcome.study, model, estimates, held_back)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,7 @@ class Draft:
 
     Attributes
     ----------
-    model : what was identified.
+    identified : what was identified.
     robot : as its first log configures it.
     source : what was written into.
     compiled : the text and what it compiles to.
@@ -104,7 +106,7 @@ class Draft:
     changes : in which it differs from the plain model.
     """
 
-    model: Identified
+    identified: Identified
     robot: Robot
     source: Source
     compiled: Compiled
@@ -153,12 +155,12 @@ def draft(model: Identified) -> Draft:
 
 def _parts(model: Identified) -> tuple[Part, ...]:
     robot = model.study.robot.for_log(model.study.train[0])
-    return make_parts(robot, model.terms, model.written, model.study.numerics)
+    return make_parts(robot, model.written, model.study.numerics)
 
 
 def _draft_in(source: Source, model: Identified, robot: Robot, target: Target) -> Draft:
     plain = compile_text(source.text)
-    changes = changes_of(plain.model, target, _estimates_of(target.parts, model))
+    changes = changes_of(plain.model, target, [model.estimates_of(part.term) for part in target.parts])
     compiled = rewrite(source.text, target.model, _notes(target, changes))
     return Draft(model, robot, source, compiled, target, changes)
 
@@ -168,16 +170,6 @@ def _is_mjcf(path: Path) -> bool:
         return parse(path.read_bytes()).tag == "mujoco"
     except (OSError, ValueError):
         return False
-
-
-def _estimates_of(parts: Sequence[Part], model: Identified) -> list[tuple[Estimate, ...]]:
-    slices: dict[int, tuple[Estimate, ...]] = {}
-    column = 0
-    for term in model.terms:
-        size = len(term.parameters)
-        slices[id(term)] = model.estimates[column : column + size]
-        column += size
-    return [slices.get(id(part.term), ()) for part in parts]
 
 
 def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], str]:
@@ -198,7 +190,7 @@ def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], 
 
 
 def _header(draft: Draft, costs: Sequence[str]) -> list[str]:
-    study = draft.model.study
+    study = draft.identified.study
     logs = ", ".join(dict.fromkeys(log.path.name for log in study.train if log.path is not None)) or "a log"
     changed = sum(bool(c.attribute) for c in draft.changes)
     added = len(draft.changes) - changed
@@ -252,8 +244,8 @@ def save_model(folder: Folder, made: Draft) -> dict[str, Any]:
     """
     name = MODEL if not _is_own(folder.path / MODEL, made.robot) else OTHER
     path = folder.write(name, made.text())
-    reported, (own, alone) = reported_losses(made.model), file_losses(made.model, path)
-    missing = [_missing(part, made.model) for part in made.missing]
+    reported, (own, alone) = reported_losses(made.identified), file_losses(made.identified, path)
+    missing = [_missing(part, made.identified) for part in made.missing]
     if missing or not own.close_to(reported):
         path = folder.write(name, made.text(_costs(own, reported)))
     return {
@@ -264,7 +256,7 @@ def save_model(folder: Folder, made: Draft) -> dict[str, Any]:
         "reported_loss": asdict(reported),
         "reproduces": alone and own.close_to(reported),
         "not_in_file": missing,
-        "not_told": list(made.model.held_back),
+        "not_told": list(made.identified.held_back),
     }
 
 
@@ -275,10 +267,9 @@ def _is_own(path: Path, robot: Robot) -> bool:
 
 def reported_losses(model: Identified) -> Losses:
     """Losses of the replays that a result reports."""
-    study = model.study
+    study, values = model.study, model.model.values
     return Losses(
-        loss_of(study.train_problem(model.terms), model.values),
-        loss_of(study.holdout_problem(model.terms), model.values),
+        loss_of(study.train_problem(model.model), values), loss_of(study.holdout_problem(model.model), values)
     )
 
 
@@ -303,12 +294,9 @@ def describe_model(outcome: Fit | Closing, result: dict[str, Any], folder: Folde
 def params_of(model: Identified) -> dict[str, Any]:
     """Content of ``params.json``: every parameter as it is written, with all that is known of it."""
     held = {id(part.term): part.held for part in _parts(model)}
-    entries, column = [], 0
-    for term in model.terms:
-        size = len(term.parameters)
-        rows = slice(column, column + size)
-        known = model.estimates[rows] or (None,) * size
-        column += size
+    entries = []
+    for term, own in model.written.parts:
+        known = model.estimates_of(term) or (None,) * len(own)
         entries.append(
             {
                 "kind": "effect" if isinstance(term, Effect) else "parameter",
@@ -329,7 +317,7 @@ def params_of(model: Identified) -> dict[str, Any]:
                         "scale": p.scale,
                         "identifiable": None if e is None else e.identifiable,
                     }
-                    for p, value, e in zip(term.parameters, model.written[rows], known, strict=True)
+                    for p, value, e in zip(term.parameters, own, known, strict=True)
                 ],
             }
         )
@@ -358,17 +346,9 @@ def _missing(part: Part, model: Identified) -> dict[str, Any]:
         "how": part.how,
         "text": describe(part),
     }
-    if part.term not in model.terms:
+    if part.term not in model.model.terms:
         return {**entry, "loss_without": None}
-    keep, column = [], 0
-    rest: list[Term] = []
-    for term in model.terms:
-        size = len(term.parameters)
-        if term is not part.term:
-            rest.append(term)
-            keep += list(range(column, column + size))
-        column += size
-    without = replace(model, terms=tuple(rest), values=model.values[keep])
+    without = replace(model, model=model.model.without(part.term))
     return {**entry, "loss_without": asdict(reported_losses(without))}
 
 
