@@ -30,7 +30,6 @@ from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.request import DECLARED
-from sysid_btr.result import make_result
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
@@ -149,7 +148,7 @@ def _close(paths: Sequence[Path], executor: Executor, threads: int = 1) -> dict[
         study = make_study(load_robot(str(MODEL)), logs, threads=threads, executor=executor)
         closing = close(study, list(DECLARED))
     wall, cpu, main_thread = perf_counter() - wall, process_time() - cpu, thread_time() - main_thread
-    result = make_result(closing)
+    result = closing.to_dict()
     return {
         "logs": len(logs),
         "seconds_of_log": round(sum(float(log.time[-1] - log.time[0]) for log in logs), 2),

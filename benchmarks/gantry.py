@@ -128,13 +128,13 @@ def examine(folder: Path, letter: str, threads: int, out: Path | None) -> Outcom
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
     from sysid_btr.models.builtin import load_robot
-    from sysid_btr.result import make_result, to_json
+    from sysid_btr.result import to_json
 
     model = folder / "nominal.xml"
     began = perf_counter()
     log = read_log(folder / f"gantry_{letter}.parquet")
     study = make_study(load_robot(str(model)), [log], threads=threads)
-    result = make_result(close(study, list(FIT)))
+    result = close(study, list(FIT)).to_dict()
     seconds = perf_counter() - began
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)

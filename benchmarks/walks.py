@@ -27,7 +27,7 @@ from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
-from sysid_btr.result import make_result, to_json
+from sysid_btr.result import to_json
 
 RESULTS = Path(__file__).parent / "results" / "walks.json"
 INERTIAL = ("mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared")
@@ -86,7 +86,7 @@ def rows(parameters: Sequence[Mapping[str, Any]], masses: Mapping[str, float]) -
 
 def fit_a(folders: Folders) -> dict[str, Any]:
     """Masses, gains and contact from walk_a."""
-    result = make_result(fit(folders.study("nao_walk/walk_a"), [*INERTIAL, *CONTACT]))
+    result = fit(folders.study("nao_walk/walk_a"), [*INERTIAL, *CONTACT]).to_dict()
     found = rows(result["parameters"], MASSES_A)
     ratio = over_floor(result)
     legs = {r["name"]: abs(r["value"] / r["truth"] - 1) for r in found if r["name"].endswith(LEGS)}
@@ -107,7 +107,7 @@ def over_floor(result: Mapping[str, Any]) -> float:
 
 
 def closing(folders: Folders, log: str, masses: Mapping[str, float]) -> tuple[dict[str, Any], list[str]]:
-    result = make_result(close(folders.study(log), list(INERTIAL)))
+    result = close(folders.study(log), list(INERTIAL)).to_dict()
     found = rows(result["parameters"], masses)
     content = {
         "verdict": result["verdict"],
@@ -184,7 +184,7 @@ def together(folders: Folders) -> dict[str, Any]:
     std: dict[str, dict[str, float]] = {}
     found: list[dict[str, Any]] = []
     for name, logs in {"hanging": [hanging], "walking": [walking], "both": [hanging, walking]}.items():
-        result = make_result(fit(make_study(robot, logs, threads=folders.threads), list(INERTIAL)))
+        result = fit(make_study(robot, logs, threads=folders.threads), list(INERTIAL)).to_dict()
         found = rows(result["parameters"], MASSES_A)
         std[name] = {r["name"]: r["std"] for r in found}
     smaller = {p: s < min(std["hanging"][p], std["walking"][p]) for p, s in std["both"].items()}

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
     from sysid_btr.io.log import Log
     from sysid_btr.models.robot import Robot
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
     from sysid_btr.simulation.numerics import Numerics
     from sysid_btr.terms.model import Model as TermModel
     from sysid_btr.terms.model import Terms
@@ -469,11 +469,11 @@ def replay(
 
     A motion that was not recorded yet (excite.parquet) is only played: where every joint goes, and the predicted log.
     """
+    from sysid_btr.identify.outcome import replay_result
     from sysid_btr.identify.replay import replay_log, set_parameters
     from sysid_btr.identify.scores import score_problem
     from sysid_btr.identify.study import make_study
     from sysid_btr.objectives.targets import COMPARED
-    from sysid_btr.result import replay_result
 
     began = time.perf_counter()
     robot = find_robot(model, None)
@@ -1124,7 +1124,7 @@ def _finish(request: Request, keeper: Keeper, job: Job, as_json: bool, render: b
 def _run(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool = False) -> int:
     """Do the work, write and print what it found; the exit code."""
     from sysid_btr.executors import open_executor
-    from sysid_btr.result import exit_code, make_result
+    from sysid_btr.result import exit_code
     from sysid_btr.writeback.write import describe_model
 
     began = time.perf_counter()
@@ -1135,7 +1135,7 @@ def _run(request: Request, keeper: Keeper, job: Job, as_json: bool, render: bool
             raise InterruptedRun(_interrupted(keeper, progress)) from None
         except LostCluster as lost:
             raise InterruptedRun(f"{lost}\n{_interrupted(keeper, progress)}") from None
-    result = make_result(outcome, seed=request.seed, wall_s=time.perf_counter() - began)
+    result = outcome.to_dict(seed=request.seed, wall_s=time.perf_counter() - began)
     if keeper.folder is not None:
         page = write_all(keeper.folder, outcome, result)
         remark(f"report: {page}")

@@ -11,7 +11,7 @@ from sysid_btr.run_folder import DRAWS, RESULT, Folder, open_folder
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
 
 
 def save(
@@ -32,10 +32,8 @@ def save(
     Path
         The report.
     """
-    from sysid_btr.result import make_result
-
     folder = open_folder(Path(out), overwrite=overwrite)
-    return write_all(folder, outcome, make_result(outcome, seed=seed))
+    return write_all(folder, outcome, outcome.to_dict(seed=seed))
 
 
 def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[str, Any]) -> Path:
@@ -43,7 +41,7 @@ def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[s
 
     The result is given what the model became, and what was drawn.
     """
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
     from sysid_btr.report.pictures import keep, pictures_of, write_report
     from sysid_btr.result import to_json
     from sysid_btr.writeback.write import describe_model
@@ -61,6 +59,6 @@ def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[s
 
 def as_model(outcome: Fit | Closing | Posterior) -> Fit | Closing:
     """What stands for an outcome where one model is asked for: a posterior's means."""
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
 
     return outcome.as_fit if isinstance(outcome, Posterior) else outcome

@@ -19,7 +19,8 @@ from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.optional import optional
-from sysid_btr.posterior.draw import Posterior, posterior
+from sysid_btr.posterior.draw import posterior
+from sysid_btr.posterior.outcome import Posterior
 from sysid_btr.posterior.sampling import Settings
 from sysid_btr.result import read_result
 

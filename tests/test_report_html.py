@@ -24,7 +24,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.figures import correlate, plot_convergence, plot_overlay, plot_residuals, trace_outcome
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.style import DARK, LIGHT, ink, page
-from sysid_btr.result import make_result, read_result
+from sysid_btr.result import read_result
 
 SAMPLES = sample_logs()
 PENDULUM = ("--model", str(SAMPLES / "pendulum.xml"), "--threads", "1")
@@ -140,7 +140,7 @@ def test_a_result_of_an_earlier_version_has_its_overlay(cli: Cli, folders: Path,
 
 
 def test_a_page_that_would_be_too_large_leaves_out_and_says_what(fitted: Fit) -> None:
-    result = {**make_result(fitted), "padding": "x" * 1_000_000}
+    result = {**fitted.to_dict(), "padding": "x" * 1_000_000}
     half = bytes(400_000)
     pictures = [Picture(f"picture {i}", "", half, half) for i in range(12)]
     text = render(result, pictures)
@@ -150,7 +150,7 @@ def test_a_page_that_would_be_too_large_leaves_out_and_says_what(fitted: Fit) ->
     assert "Left out" in text
     assert "picture 11" in text.partition("Left out")[2]
     assert "result.json beside this page" in text
-    few = render(make_result(fitted), pictures[:2])
+    few = render(fitted.to_dict(), pictures[:2])
     assert few.count("<source") == 2
     assert "Left out" not in few
 

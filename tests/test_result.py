@@ -20,7 +20,7 @@ from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.html import Picture, render
-from sysid_btr.result import clean, exit_code, make_result, read_result, to_json
+from sysid_btr.result import clean, exit_code, read_result, to_json
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.model import Model
 from sysid_btr.units import si, si_all, with_digits_of
@@ -121,7 +121,7 @@ def closing(study: Study, **changes: object) -> Closing:
 
 
 def test_every_promised_key_is_there(study: Study) -> None:
-    result = make_result(closing(study), seed=4)
+    result = closing(study).to_dict(seed=4)
     assert set(result) >= PROMISED
     for stage in ("nominal", "before", "after"):
         for part in ("train", "holdout"):
@@ -135,7 +135,7 @@ def test_every_promised_key_is_there(study: Study) -> None:
 
 
 def test_round_trip(study: Study, tmp_path: Path) -> None:
-    result = make_result(closing(study), seed=4, wall_s=2.5)
+    result = closing(study).to_dict(seed=4, wall_s=2.5)
     file = tmp_path / "result.json"
     file.write_text(to_json(result))
     assert read_result(file) == result
@@ -143,7 +143,7 @@ def test_round_trip(study: Study, tmp_path: Path) -> None:
 
 
 def test_what_is_not_finite_is_null(study: Study) -> None:
-    text = to_json(make_result(closing(study)))
+    text = to_json(closing(study).to_dict())
     result = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in result.json"))
     assert result["parameters"][0]["bounds"] == [0.0, None]
     assert result["candidates"][0]["amplitude"] is None
@@ -180,7 +180,7 @@ def test_what_is_no_result_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_exit_code_tells_a_finding_from_a_failure(study: Study) -> None:
-    result = make_result(closing(study))
+    result = closing(study).to_dict()
     assert exit_code(result) == 0
     assert exit_code({**result, "effects": []}) == 5
     assert exit_code({**result, "effects": [], "parameters": []}) == 0
@@ -191,7 +191,7 @@ def test_exit_code_tells_a_finding_from_a_failure(study: Study) -> None:
 
 @pytest.mark.parametrize("verdict", ["explained", "nothing_missing", "ambiguous", "unexplained"])
 def test_the_report_holds_every_finding_and_escapes_names(study: Study, verdict: str) -> None:
-    result = make_result(closing(study, verdict=verdict, message="a <b>bold</b> claim"))
+    result = closing(study, verdict=verdict, message="a <b>bold</b> claim").to_dict()
     page = render(result, [Picture("overlay", "how to read it", b"light", b"dark")])
     for text in ("mass:arm", "hardly any sensor responds", "coulomb_friction", "stribeck_friction"):
         assert text in page
@@ -205,7 +205,7 @@ def test_the_report_holds_every_finding_and_escapes_names(study: Study, verdict:
 def test_tables_name_effect_interval_and_reason(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
     import sys
 
-    show(make_result(closing(study, verdict="ambiguous")), console(sys.stdout))
+    show(closing(study, verdict="ambiguous").to_dict(), console(sys.stdout))
     text = capsys.readouterr().out
     for part in (
         "dry friction at <hinge>",

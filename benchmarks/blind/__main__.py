@@ -114,7 +114,7 @@ def examine(case: Case, code: str, recipe: str, out: Path, threads: int = 0) -> 
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
     from sysid_btr.models.builtin import load_robot as load_model
-    from sysid_btr.result import make_result, to_json
+    from sysid_btr.result import to_json
 
     path = HERE / "logs" / recipe / f"{case.id.replace('/', '_')}.parquet"
     if not path.with_suffix(".truth.json").exists():
@@ -125,7 +125,7 @@ def examine(case: Case, code: str, recipe: str, out: Path, threads: int = 0) -> 
     began = perf_counter()
     try:
         study = make_study(load_model(str(case.bench.model)), [read_log(path)], threads=threads)
-        result = make_result(close(study, list(case.bench.fit)))
+        result = close(study, list(case.bench.fit)).to_dict()
     except Exception:
         text = traceback.format_exc()
         sys.stderr.write(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.btr.loop import BackToReality, Iteration
 from sysid_btr.btr.trials import Tried
 from sysid_btr.identify.intervals import Estimate, estimates
-from sysid_btr.result import SCHEMA, clean, estimate_entry, model_entry, versions
+from sysid_btr.result import SCHEMA, clean, versions
 
 if TYPE_CHECKING:
     from sysid_btr.btr.problems import Stage
@@ -51,7 +52,7 @@ def btr_result(outcome: BackToReality, *, wall_s: float | None = None) -> dict[s
             "before": {"train": _score(plain, real), "holdout": _score(plain[rows], real[rows])},
             # held out: what was foreseen of the last trials before the model had seen them
             "after": {"train": _score(final, real), "holdout": _score(foreseen[rows], real[rows])},
-            "parameters": [estimate_entry(e) for e in estimate_model(outcome)],
+            "parameters": [asdict(e) for e in estimate_model(outcome)],
             "effects": [],
             "candidates": [],
             "steps": [],
@@ -85,7 +86,7 @@ def btr_result(outcome: BackToReality, *, wall_s: float | None = None) -> dict[s
             "channels": ["position"],
             "versions": versions(),
             "logs": [],
-            "model": model_entry(world.robot),
+            "model": world.robot.to_dict(),
             "seed": outcome.seed,
             "replays": outcome.simulations,
             "wall_s": outcome.seconds if wall_s is None else wall_s,

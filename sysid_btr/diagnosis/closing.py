@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.outcome import study_result
 from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.model import Model
@@ -109,8 +110,32 @@ class Closing:
         """(p,) values of all parameters of the final model."""
         return self.model.values
 
+    def to_dict(self, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
+        """The content of result.json.
+
+        Parameters
+        ----------
+        seed : of the generator the estimator was given.
+        wall_s : wall time to record, s; default that of the closing.
+        """
+        found = {
+            "kind": "close",
+            "verdict": self.verdict,
+            "message": self.message,
+            "noise_floor": dict(self.noise_floor),
+            "nominal": self.nominal.to_dict(),
+            "before": self.before.to_dict(),
+            "after": self.after.to_dict(),
+            "parameters": [asdict(e) for e in self.parameters],
+            "effects": [asdict(e) for e in self.effects],
+            "candidates": [asdict(c) for c in self.candidates],
+            "steps": [asdict(s) for s in self.steps],
+            "signature": self.signature,
+        }
+        wall_s = self.seconds if wall_s is None else wall_s
+        return study_result(self.study, found, seed=seed, replays=self.replays, wall_s=wall_s)
+
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import result_html
-        from sysid_btr.result import make_result
 
-        return result_html(make_result(self))
+        return result_html(self.to_dict())

@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sysid_btr.estimators.base import Termination
-from sysid_btr.result import SCHEMA, clean, estimate_entry, model_entry, to_json, versions
+from sysid_btr.result import SCHEMA, clean, to_json, versions
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -69,7 +70,7 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
             "message": message(design),
             "termination": design.result.termination.value,
             "parameters": [
-                {**estimate_entry(a), "reference": _told(b), "ratio": float(ratio) if told else None}
+                {**asdict(a), "reference": _told(b), "ratio": float(ratio) if told else None}
                 for a, b, ratio, told in zip(after, before, design.ratios, design.told, strict=True)
             ],
             "effects": [],
@@ -100,7 +101,7 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
             "noise_floor_source": design.experiment.sensors.source,
             "numerics": {"chosen": str(design.experiment.numerics)},
             "versions": versions(),
-            "model": model_entry(design.experiment.robot),
+            "model": design.experiment.robot.to_dict(),
             "seed": seed,
             "motions_tried": design.result.evaluations,
             "wall_s": design.seconds,
@@ -110,7 +111,7 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
 
 
 def _told(estimate: Estimate) -> dict[str, Any]:
-    entry = estimate_entry(estimate)
+    entry = asdict(estimate)
     return {key: entry[key] for key in ("std", "ci95", "identifiable", "reason")}
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,14 +20,17 @@ from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fusion import weigh_walks
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, Profile, estimates
 from sysid_btr.identify.numerics import held_numerics
+from sysid_btr.identify.outcome import study_result
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten, walking
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.study import Study
+from sysid_btr.models.robot import channel_units
 from sysid_btr.objectives.covariance import RANK, Known, newton
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model, Terms
+from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -82,11 +85,62 @@ class Fit:
         """(p,) the estimates' values."""
         return self.model.values
 
+    @property
+    def message(self) -> str:
+        """The outcome in one sentence."""
+        told = sum(e.identifiable != "no" for e in self.estimates)
+        parts = [f"{told} of {len(self.estimates)} parameters can be told from this log"]
+        if "position" in self.before.holdout:
+            nominal, before = self.nominal.holdout["position"], self.before.holdout["position"]
+            unit = channel_units(self.study.robot)["position"].partition(",")[0]
+            first, last, floor = si_all([nominal.rmse, before.rmse, before.floor], unit)
+            parts.append(
+                f"the held-out position error goes from {first} to {last}, "
+                f"where the sensor's own noise is {floor}"
+            )
+        if not self.result.converged:
+            parts.append("the fit did not converge")
+        return "; ".join(parts) + "."
+
+    @property
+    def found(self) -> dict[str, Any]:
+        """What results of kind ``fit`` have beside study and cost; as no effect is added, after equals before."""
+        before = self.before.to_dict()
+        return {
+            "kind": "fit",
+            "message": self.message,
+            "converged": self.result.converged,
+            "termination": self.result.termination.value,
+            "noise_floor": self.before.floors,
+            "nominal": self.nominal.to_dict(),
+            "before": before,
+            "after": before,
+            "parameters": [
+                {**asdict(e), "numerics_shift": float(shift)}
+                for e, shift in zip(self.estimates, self.numerics_shift, strict=True)
+            ],
+            "effects": [],
+            "candidates": [],
+            "steps": [],
+            "signature": None,
+            **({"profiles": [p.to_dict() for p in self.profiles]} if self.profiles else {}),
+        }
+
+    def to_dict(self, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
+        """The content of result.json.
+
+        Parameters
+        ----------
+        seed : of the generator the estimator was given.
+        wall_s : wall time to record, s; default that of the fit.
+        """
+        wall_s = self.seconds if wall_s is None else wall_s
+        return study_result(self.study, self.found, seed=seed, replays=self.replays, wall_s=wall_s)
+
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import result_html
-        from sysid_btr.result import make_result
 
-        return result_html(make_result(self))
+        return result_html(self.to_dict())
 
 
 def fit(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -74,6 +74,19 @@ class Profile:
     interval: tuple[float, float]
     closed: tuple[bool, bool]
     replays: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """As results have it."""
+        return {
+            "name": self.name,
+            "unit": self.unit,
+            "values": self.values,
+            "deviance": self.deviance,
+            "threshold": self.threshold,
+            "ci95": self.interval,
+            "closed": self.closed,
+            "replays": self.replays,
+        }
 
 
 def estimates(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,6 +43,23 @@ class Scores:
 
     train: Mapping[str, ChannelScore]
     holdout: Mapping[str, ChannelScore]
+
+    @property
+    def floors(self) -> dict[str, float]:
+        """Noise floor of each channel."""
+        return {channel: s.floor for channel, s in (self.holdout or self.train).items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """By part and channel, as results have them."""
+        return {"train": channel_entries(self.train), "holdout": channel_entries(self.holdout)}
+
+
+def channel_entries(part: Mapping[str, ChannelScore]) -> dict[str, dict[str, Any]]:
+    """Scores by channel: rmse, nrmse, chi2, and the rmse of each joint."""
+    return {
+        channel: {"rmse": s.rmse, "nrmse": s.nrmse, "chi2": s.chi2, "joints": dict(s.joints)}
+        for channel, s in part.items()
+    }
 
 
 def score(study: Study, model: Model) -> Scores:

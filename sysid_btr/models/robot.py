@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from sysid_btr.errors import ModelError
 from sysid_btr.terms.base import Scope, Term
+from sysid_btr.units import CHANNEL_UNITS
 
 if TYPE_CHECKING:
     import mujoco
@@ -56,6 +57,10 @@ class Robot:
             "mass": f"{float(self.compile().body_mass.sum()):.4g} kg",
         }
         return facts_html(f"robot {self.name}", facts)
+
+    def to_dict(self) -> dict[str, str | None]:
+        """Name, file and digest, as results have them."""
+        return {"name": self.name, "path": None if self.path is None else str(self.path), "sha256": self.digest}
 
     def for_log(self, log: Log) -> Robot:
         """The robot as this log's metadata describes it (servo registers, supply, load)."""
@@ -121,6 +126,14 @@ def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
         if model.jnt_type[i] in (2, 3) and high > low:
             ranges[model.joint(i).name] = (float(low), float(high))
     return ranges
+
+
+def channel_units(robot: Robot) -> dict[str, str]:
+    """Unit of each channel on this robot; both where it has hinges and slides."""
+    model = robot.compile()
+    slides = {int(model.joint(j).type[0]) == 2 for j in joint_names(robot)}
+    kinds = [k for k, there in ((0, False in slides), (1, True in slides)) if there]
+    return {channel: ", ".join(units[k] for k in kinds) for channel, units in CHANNEL_UNITS.items()}
 
 
 def body_names(robot: Robot) -> tuple[str, ...]:

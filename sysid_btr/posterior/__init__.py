@@ -14,11 +14,12 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sysid_btr.posterior.draw import Posterior, posterior
+    from sysid_btr.posterior.draw import posterior
     from sysid_btr.posterior.export import to_datatree
+    from sysid_btr.posterior.outcome import Posterior
     from sysid_btr.posterior.sampling import Settings
 
-_HOME = {"Posterior": "draw", "posterior": "draw", "to_datatree": "export", "Settings": "sampling"}
+_HOME = {"Posterior": "outcome", "posterior": "draw", "to_datatree": "export", "Settings": "sampling"}
 
 __all__ = ["Posterior", "Settings", "posterior", "to_datatree"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -14,82 +14,21 @@ from sysid_btr.estimators.base import Budget, Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import Estimate, tell
-from sysid_btr.identify.scores import Scores, score
-from sysid_btr.posterior.likelihood import Likelihood, make_likelihood, settle
-from sysid_btr.posterior.predictive import Band, coverage, predict_bands
-from sysid_btr.posterior.priors import Prior, choose_priors, moments
+from sysid_btr.identify.scores import score
+from sysid_btr.posterior.likelihood import make_likelihood, settle
+from sysid_btr.posterior.outcome import Posterior
+from sysid_btr.posterior.predictive import coverage, predict_bands
+from sysid_btr.posterior.priors import choose_priors
 from sysid_btr.posterior.sampling import Sample, Settings, sample
 
 if TYPE_CHECKING:
     from numpy.random import Generator
-
-    from sysid_btr.identify.study import Study
 
 BUDGET = Budget(evaluations=20_000)
 """Where nothing is said."""
 PREDICTIVE_DRAWS = 48
 AT_BOUND = (0.1, 0.04)
 """At its bound: more than this share (second) of the draws within this many standard deviations of it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Posterior:
-    """Draws of the posterior of a fit's parameters.
-
-    Attributes
-    ----------
-    fit : what it began from.
-    priors : one a parameter.
-    likelihood : what a replay's loss was taken to say.
-    sample : draws, and whether they converged.
-    estimates : mean, standard deviation and central 95 % of the draws, one a parameter.
-    values : (p,) posterior means.
-    after : scores at the means, on fitted and held-out data.
-    bands : predictions of every held-out sensor.
-    coverage : channel -> share of held-out samples inside the 95 % bands.
-    replays : candidates simulated, those of the fit included.
-    seconds : wall time, that of the fit included.
-    """
-
-    fit: Fit
-    priors: tuple[Prior, ...]
-    likelihood: Likelihood
-    sample: Sample
-    estimates: tuple[Estimate, ...]
-    values: FloatArray
-    after: Scores
-    bands: tuple[Band, ...]
-    coverage: Mapping[str, float]
-    replays: int
-    seconds: float
-
-    def _repr_html_(self) -> str:
-        from sysid_btr.display.html import result_html
-        from sysid_btr.result import make_result
-
-        return result_html(make_result(self))
-
-    @property
-    def study(self) -> Study:
-        """As fitted."""
-        return self.fit.study
-
-    @property
-    def as_fit(self) -> Fit:
-        """The model of the posterior means, where a fit is asked for."""
-        return replace(self.fit, model=self.fit.model.at(self.values), estimates=self.estimates, before=self.after)
-
-    @property
-    def converged(self) -> bool:
-        """Whether the draws can be relied on."""
-        return self.sample.converged
-
-    @property
-    def learnt(self) -> FloatArray:
-        """(p,) posterior over prior standard deviation: 1 where the log says nothing."""
-        pairs = zip(self.priors, self.fit.model.terms.parameters, strict=True)
-        prior = [moments(prior, p.lower, p.upper)[1] for prior, p in pairs]
-        return np.asarray(np.array([e.std for e in self.estimates]) / np.array(prior))
 
 
 def posterior(

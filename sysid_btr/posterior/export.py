@@ -12,7 +12,7 @@ from sysid_btr.optional import optional
 from sysid_btr.version import __version__
 
 if TYPE_CHECKING:
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
 
 SCHEMA = "sysid_btr.posterior/1"
 

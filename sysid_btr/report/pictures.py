@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.intervals import Profile
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
 
     Draw = Callable[[], Figure]
 
@@ -97,7 +97,7 @@ CAPTIONS: Mapping[str, Caption] = {
 def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]]:
     """Names of an outcome's pictures and what draws them, in the order of the report."""
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
     from sysid_btr.report.figures import figure_of, plot_convergence, plot_overlay, plot_residuals, trace_outcome
 
     model = outcome.as_fit if isinstance(outcome, Posterior) else outcome

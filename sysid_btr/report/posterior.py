@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sysid_btr.identify.intervals import Profile
-    from sysid_btr.posterior.draw import Posterior
+    from sysid_btr.posterior.outcome import Posterior
     from sysid_btr.posterior.predictive import Band
 
 MOST_PARAMETERS = 12

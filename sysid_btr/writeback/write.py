@@ -14,7 +14,7 @@ from sysid_btr.errors import ModelError, SysidError
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import Robot
-from sysid_btr.result import clean, model_entry, to_json
+from sysid_btr.result import clean, to_json
 from sysid_btr.run_folder import MODEL, PARAMS, Folder
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect
@@ -323,7 +323,7 @@ def params_of(model: Identified) -> dict[str, Any]:
         )
     return {
         "schema": PARAMS_SCHEMA,
-        "model": model_entry(model.study.robot),
+        "model": model.study.robot.to_dict(),
         "numerics": asdict(model.study.numerics),
         "modifiers": entries,
     }

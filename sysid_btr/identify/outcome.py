@@ -1,0 +1,121 @@
+"""What every outcome of a study puts into result.json, whatever was found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from sysid_btr.floating_base.walk import Walk
+from sysid_btr.identify.scores import ChannelScore, channel_entries
+from sysid_btr.identify.study import Study
+from sysid_btr.models.robot import channel_units
+from sysid_btr.result import SCHEMA, clean, versions
+from sysid_btr.units import si_all
+
+COUNTED_LESS = 0.9
+"""Weight below which a window of a walk counts as one that the model does not explain."""
+
+
+def study_result(
+    study: Study, found: Mapping[str, Any], *, seed: int | None, replays: int, wall_s: float
+) -> dict[str, Any]:
+    """The content of result.json.
+
+    Parameters
+    ----------
+    study : data and model, as fitted.
+    found : ``kind``, ``message`` and what belongs to this kind of result.
+    seed : of the generator the estimator was given; None where nothing is drawn.
+    replays : candidates simulated.
+    wall_s : wall time, s.
+
+    Returns
+    -------
+    dict
+        Ready for `json.dumps(..., allow_nan=False)`.
+    """
+    plain: dict[str, Any] = clean(
+        {"schema": SCHEMA, **found, **_provenance(study), "seed": seed, "replays": replays, "wall_s": wall_s}
+    )
+    return plain
+
+
+def replay_result(
+    study: Study, scores: Mapping[str, ChannelScore], parameters: Mapping[str, float], wall_s: float
+) -> dict[str, Any]:
+    """Content of a result of kind ``replay``: nothing is fitted, so all data counts as held out."""
+    position = scores.get("position")
+    message = "the replay diverged"
+    if position is not None and math.isfinite(position.rmse):
+        unit = channel_units(study.robot)["position"].partition(",")[0]
+        error, floor = si_all([position.rmse, position.floor], unit)
+        message = f"position error {error}, where the sensor's own noise is {floor}."
+    found = {
+        "kind": "replay",
+        "message": message,
+        "noise_floor": {channel: s.floor for channel, s in scores.items()},
+        "nominal": {"train": {}, "holdout": channel_entries(scores)},
+        "set": dict(parameters),
+        "parameters": [],
+        "effects": [],
+    }
+    return study_result(study, found, seed=None, replays=len(study.holdout), wall_s=wall_s)
+
+
+def _provenance(study: Study) -> dict[str, Any]:
+    return {
+        "units": channel_units(study.robot),
+        "numerics": {
+            "integrator": study.numerics.integrator,
+            "timestep": study.numerics.timestep,
+            "error_in_noise_floors": study.numerics_error,
+            "chosen": str(study.numerics),
+        },
+        "channels": study.channels,
+        **({"walks": _walks(study)} if study.free else {}),
+        "versions": versions(),
+        "logs": _logs(study),
+        "model": study.robot.to_dict(),
+    }
+
+
+def _walks(study: Study) -> list[dict[str, Any]]:
+    """How each log of a free base was cut up, and what its base state lacks."""
+    return [
+        {
+            "path": None if log.path is None else str(log.path),
+            "part": part,
+            "window": log.seconds,
+            "windows": len(log.windows),
+            "counted_less": int(np.sum(log.marginal.weight < COUNTED_LESS)) if log.marginal is not None else 0,
+            "windows_tried": [asdict(choice) for choice in log.choices],
+            "events": [str(event) for event in log.base.events],
+            "used_until": float(log.time[-1]),
+            "lost": log.base.lost,
+        }
+        for part, logs in (("train", study.train), ("holdout", study.holdout))
+        for log in logs
+        if isinstance(log, Walk) and log.windows is not None and log.base is not None
+    ]
+
+
+def _logs(study: Study) -> list[dict[str, Any]]:
+    from sysid_btr.io.parquet import sha256
+
+    fitted = {log.path for log in study.train}
+    held = {log.path for log in study.holdout}
+    entries = []
+    for path in dict.fromkeys(log.path for log in (*study.train, *study.holdout)):
+        parts = [name for name, paths in (("train", fitted), ("holdout", held)) if path in paths]
+        entries.append(
+            {
+                "path": None if path is None else str(path),
+                "sha256": None if path is None else sha256(path),
+                "used_for": parts,
+            }
+        )
+    return entries
