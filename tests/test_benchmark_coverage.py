@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +11,10 @@ import pytest
 
 pytest.importorskip("pinocchio", reason="the recorder needs pin (pip install pin)", exc_type=ImportError)
 
-ROOT = Path(__file__).resolve().parents[1]
-if str(ROOT) not in sys.path:  # benchmarks are not installed with the package
-    sys.path.insert(0, str(ROOT))
-
-from benchmarks.coverage import __main__ as command  # noqa: E402
-from benchmarks.coverage.draw import BENCHES, SPREAD, draw  # noqa: E402
-from benchmarks.coverage.summary import Count, latest, over_logs, summarise, width_ratio  # noqa: E402
-from benchmarks.coverage.table import Row, append, read_rows  # noqa: E402
+from benchmarks.coverage import __main__ as command
+from benchmarks.coverage.draw import BENCHES, SPREAD, draw
+from benchmarks.coverage.summary import Count, latest, over_logs, summarise, width_ratio
+from benchmarks.coverage.table import Row, append, read_rows
 
 ROW = Row(
     robot="leg",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +14,6 @@ import pytest
 pin = pytest.importorskip(
     "pinocchio", reason="the recorder needs Pinocchio (pip install pin)", exc_type=ImportError
 )
-
-ROOT = Path(__file__).parents[1]
-if str(ROOT) not in sys.path:  # benchmarks and sample_logs are not installed with the package
-    sys.path.insert(0, str(ROOT))
 
 from reference_simulator import (  # noqa: E402
     EFFECTS,
@@ -34,7 +29,7 @@ from reference_simulator import (  # noqa: E402
 from reference_simulator.__main__ import main  # noqa: E402
 from reference_simulator.robot import build_pinocchio  # noqa: E402
 
-NAO = ROOT / "sample_logs" / "nao.xml"
+NAO = Path(__file__).parents[1] / "sample_logs" / "nao.xml"
 ROBOTS = [NAO, "six_joint_leg", "pendulum"]
 KP, KV, DAMPING, ARMATURE = 12.0, 0.3, 0.08, 0.006  # of pendulum.xml
 MASS, MOMENT = 0.5, 0.2 * 0.1 + 0.3 * 0.2  # kg, kg m
