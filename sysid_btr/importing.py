@@ -73,9 +73,10 @@ def known_model(wanted: str | Robot | None) -> KnownModel | None:
     from sysid_btr.io.importers.run import KnownModel
     from sysid_btr.models.builtin import load_robot
     from sysid_btr.models.robot import joint_names, joint_ranges
+    from sysid_btr.mujoco_conventions import slides
 
     robot = load_robot(wanted) if isinstance(wanted, str) else wanted
     model = robot.compile()
     joints = joint_names(robot)
-    sliding = tuple(joint for joint in joints if int(model.joint(joint).type[0]) == 2)
+    sliding = tuple(joint for joint in joints if slides(model, joint))
     return KnownModel(robot.name, joints, joint_ranges(robot), sliding)

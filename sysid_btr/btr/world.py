@@ -14,6 +14,7 @@ from sysid_btr.btr.task import Walk
 from sysid_btr.errors import ModelError
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.robot import Robot
+from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import CHUNK, Replay
@@ -39,7 +40,7 @@ class World(Replay):
     @cached_property
     def index(self) -> JointAddresses:
         model = self.model
-        free = np.flatnonzero(model.jnt_type == 0)
+        free = free_joints(model)
         if len(free) != 1:
             raise ModelError(
                 f"model {self.robot.name}: {len(free)} free joints; a robot that walks has one, at its base"

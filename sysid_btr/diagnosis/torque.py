@@ -17,6 +17,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target
 from sysid_btr.simulation.subtrees import subtrees
+from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.effect import scale_at
 from sysid_btr.terms.external_disturbance import ExternalDisturbanceTrain
 from sysid_btr.terms.scales import Scales
@@ -153,19 +154,9 @@ def _deconvolve(
     if memory < 4:
         return []
     sizes = np.array([scale_at(scales, j).torque_peak for j in joints])
-    depth = max(len(m) for m in members.values())
-    train = ExternalDisturbanceTrain.at(joints, scales)
     width = max(clock.period, episode.replay.numerics.timestep)
-    rest = np.tile([0.0, clock.period * memory, width, clock.period * memory], (len(joints), 1))
-    amounts = np.zeros((1 + depth, len(joints)))
-    for own in members.values():
-        for row, k in enumerate(own, start=1):
-            amounts[row, k] = sizes[k]
-    pulses = np.tile(rest, (1 + depth, 1, 1))
-    pulses[:, :, 0] = amounts
-    candidates = np.hstack([np.tile(values, (1 + depth, 1)), pulses.reshape(1 + depth, -1)])
-    replay = replace(episode.replay, terms=(*episode.replay.terms, train), effort=True)
-    outputs = replay.predict(candidates)
+    rest = (0.0, clock.period * memory, width, clock.period * memory)
+    outputs = _pulsed(episode, values, ExternalDisturbanceTrain.at(joints, scales), rest, sizes, list(members.values()))
     predicted = outputs.position[:, :, target.columns]
     if not np.isfinite(predicted).all() or outputs.effort is None:
         return []
@@ -219,6 +210,22 @@ def _deconvolve(
         )
         for k, joint in enumerate(joints)
     ]
+
+
+def _pulsed(
+    episode: Episode, values: FloatArray, train: Term, rest: Sequence[float], sizes: FloatArray, members: list[list[int]]
+) -> Outputs:
+    """Sensors without a pulse, and with pulses of given sizes at one joint of every subtree at a time.
+
+    `rest` are the numbers of a joint's train of pulses, the size first; `members` the joints of each subtree.
+    """
+    count = 1 + max(len(own) for own in members)
+    pulses = np.tile(np.asarray(rest), (count, len(sizes), 1))
+    for own in members:
+        for row, k in enumerate(own, start=1):
+            pulses[row, k, 0] = sizes[k]
+    candidates = np.hstack([np.tile(values, (count, 1)), pulses.reshape(count, -1)])
+    return replace(episode.replay, terms=(*episode.replay.terms, train), effort=True).predict(candidates)
 
 
 def _servo_as_measured(states: dict[str, FloatArray], period: float) -> FloatArray:

@@ -32,6 +32,7 @@ from sysid_btr.identify.study import measure_scales
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.split import split_episodes
 from sysid_btr.models.robot import Robot
+from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
@@ -104,7 +105,7 @@ def find_sensors(robot: Robot, reference: Log | None = None, noise: float | None
         raise UsageError(f"--noise {noise:g}: the standard deviation of a position sensor is positive")
     joints = joint_names(robot)
     if reference is None:
-        if noise is None and any(int(robot.compile().joint(j).type[0]) == 2 for j in joints):
+        if noise is None and any(slides(robot.compile(), j) for j in joints):
             raise UsageError(
                 f"model {robot.name} has sliding joints, and what noise their sensors have cannot be guessed: give "
                 "--log, or --noise in m"
@@ -421,15 +422,7 @@ def design(
         The model has no servo, or diverges.
     """
     began = perf_counter()
-    if reference is not None:
-        if reference.meta.mount == "free":
-            raise UsageError(
-                f"{reference.path or 'the reference log'} is of a robot that was free to move; motions are designed "
-                "for a robot whose torso is held: give a log of that, or none and --noise"
-            )
-        robot = robot.for_log(reference)
-    elif robot.configure is not None:
-        raise UsageError(f"model {robot.name} takes the settings of its servos from a log: give one with --log")
+    robot = configured(robot, reference)
     rng = np.random.default_rng(0) if rng is None else rng
     motors = find_motors(
         robot, joints=joints, reference=reference, margin=margin, velocity=velocity, acceleration=acceleration
@@ -467,6 +460,26 @@ def design(
         beyond=_beyond(robot, problem.episodes[0].replay),
         seconds=perf_counter() - began,
     )
+
+
+def configured(robot: Robot, reference: Log | None) -> Robot:
+    """The robot with the settings of the reference log.
+
+    Raises
+    ------
+    UsageError
+        If it has none but needs them, or the log is of a robot that was free to move.
+    """
+    if reference is None:
+        if robot.configure is not None:
+            raise UsageError(f"model {robot.name} takes the settings of its servos from a log: give one with --log")
+        return robot
+    if reference.meta.mount == "free":
+        raise UsageError(
+            f"{reference.path or 'the reference log'} is of a robot that was free to move; motions are designed "
+            "for a robot whose torso is held: give a log of that, or none and --noise"
+        )
+    return robot.for_log(reference)
 
 
 def cheap(experiment: Experiment, log: Log) -> Experiment:

@@ -21,6 +21,7 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.floating_base.estimate import NEAR, foot_loads, imu_columns, lowest_points, vertical
 from sysid_btr.floating_base.feet import touching_bodies
 from sysid_btr.floating_base.walk import Walk, starts_at
+from sysid_btr.mujoco_conventions import to_rotation
 from sysid_btr.objectives.covariance import Known, covariance
 from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
@@ -426,9 +427,7 @@ def candidate_model(replay: WindowReplay, values: FloatArray) -> mujoco.MjModel:
 
 def difference(a: Windows, b: Windows) -> FloatArray:
     """(w, d) change that takes states `b` to `a`, in the coordinates of `Windows.std`."""
-    from scipy.spatial.transform import Rotation
-
-    turned, from_here = (Rotation.from_quat(s.quaternion[:, [1, 2, 3, 0]]) for s in (a, b))
+    turned, from_here = (to_rotation(s.quaternion) for s in (a, b))
     return np.concatenate(
         [
             a.position - b.position,
@@ -535,11 +534,9 @@ def _each(kinds: Sequence[float], states: Windows) -> FloatArray:
 
 def _measurements(chain: _Chain) -> tuple[FloatArray, FloatArray]:
     """Whitened derivatives (n, m, d) of what is measured by the states, and what they leave of it, (n, m)."""
-    from scipy.spatial.transform import Rotation
-
     states = chain.states
     n, j = states.joint_position.shape
-    up = Rotation.from_quat(states.quaternion[:, [1, 2, 3, 0]]).as_matrix()[:, 2]
+    up = to_rotation(states.quaternion).as_matrix()[:, 2]
     sight = np.zeros((n, j + 5, states.std.shape[1]))
     sight[:, np.arange(j), BASE + np.arange(j)] = 1.0
     sight[:, j + np.arange(3), 9 + np.arange(3)] = 1.0

@@ -19,6 +19,7 @@ from sysid_btr.floating_base.events import Event, find_fall, find_pickups, find_
 from sysid_btr.floating_base.feet import Foot, base_body, force_columns, points_in_base, touching_bodies
 from sysid_btr.floating_base.orientation import smooth_orientation, up_in_base
 from sysid_btr.floating_base.smoothing import Tracks, smooth, smooth_joints
+from sysid_btr.mujoco_conventions import to_quaternion
 from sysid_btr.objectives.noise import noise_floor
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ class BaseState:
         """(n, 4) orientation as MuJoCo has it, scalar first."""
         from scipy.spatial.transform import Rotation
 
-        return np.asarray(Rotation.from_matrix(self.rotation).as_quat()[:, [3, 0, 1, 2]])
+        return to_quaternion(Rotation.from_matrix(self.rotation))
 
     def rows(self, start: int, stop: int) -> BaseState:
         """Samples `start` to `stop` (exclusive)."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.mujoco_conventions import free_joints
 
 if TYPE_CHECKING:
     import mujoco
@@ -118,7 +119,7 @@ def points_in_base(
 
 def base_body(model: mujoco.MjModel) -> int:
     """Id of the body that the free joint moves, or -1."""
-    free = np.flatnonzero(model.jnt_type == 0)
+    free = free_joints(model)
     return int(model.jnt_bodyid[free[0]]) if len(free) else -1
 
 

@@ -28,6 +28,7 @@ from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split, split_episodes
 from sysid_btr.models.robot import Robot, joint_names
+from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.compiling import make_index
@@ -311,7 +312,7 @@ def measure_scales(
             velocity_peak=max(float(np.nanmax(np.abs(v[:, i]))), TINY),
             acceleration_rms=max(float(rms(a)[i]), TINY),
             span=max(float(reach[i]), TINY),
-            slide=int(model.joint(joint).type[0]) == 2,
+            slide=slides(model, joint),
             measured_rms=float(rms(asked)) if len(asked) else 0.0,
             measured_peak=float(np.max(np.abs(asked), initial=0.0)),
         )

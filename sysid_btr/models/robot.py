@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sysid_btr.errors import ModelError
+from sysid_btr.mujoco_conventions import SINGLE, slides
 from sysid_btr.terms.base import Scope, Term
 from sysid_btr.units import CHANNEL_UNITS
 
@@ -114,7 +115,7 @@ def robot_from_spec(name: str, make_spec: Callable[[], mujoco.MjSpec], **known: 
 def joint_names(robot: Robot) -> tuple[str, ...]:
     """Hinge and slide joints of the model, in model order."""
     model = robot.compile()
-    return tuple(model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in (2, 3))
+    return tuple(model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in SINGLE)
 
 
 def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
@@ -123,7 +124,7 @@ def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
     ranges = {}
     for i in range(model.njnt):
         low, high = model.jnt_range[i]
-        if model.jnt_type[i] in (2, 3) and high > low:
+        if model.jnt_type[i] in SINGLE and high > low:
             ranges[model.joint(i).name] = (float(low), float(high))
     return ranges
 
@@ -131,8 +132,8 @@ def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
 def channel_units(robot: Robot) -> dict[str, str]:
     """Unit of each channel on this robot; both where it has hinges and slides."""
     model = robot.compile()
-    slides = {int(model.joint(j).type[0]) == 2 for j in joint_names(robot)}
-    kinds = [k for k, there in ((0, False in slides), (1, True in slides)) if there]
+    found = {slides(model, j) for j in joint_names(robot)}
+    kinds = [k for k, there in ((0, False in found), (1, True in found)) if there]
     return {channel: ", ".join(units[k] for k in kinds) for channel, units in CHANNEL_UNITS.items()}
 
 

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.mujoco_conventions import slides
 from sysid_btr.units import CHANNEL_UNITS
 
 if TYPE_CHECKING:
+    import mujoco
+
     from sysid_btr.identify.study import Study
     from sysid_btr.objectives.problem import ReplayProblem
     from sysid_btr.terms.model import Model
@@ -128,6 +131,5 @@ def _fitted_error(problem: ReplayProblem, values: FloatArray) -> Mapping[tuple[s
     return {key: float(np.sqrt(np.mean(np.concatenate(parts)))) for key, parts in squares.items()}
 
 
-def _unit(channel: str, model: object, joint: str) -> str:
-    slide = int(model.joint(joint).type[0]) == 2  # type: ignore[attr-defined]
-    return CHANNEL_UNITS[channel][slide]
+def _unit(channel: str, model: mujoco.MjModel, joint: str) -> str:
+    return CHANNEL_UNITS[channel][slides(model, joint)]

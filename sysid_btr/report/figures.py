@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.mujoco_conventions import slides
 from sysid_btr.report.style import FOUND, MODEL_COLOURS, PLAIN, SHADE, faint, ink, new_figure, on_page
 from sysid_btr.terms.model import Model
 from sysid_btr.units import si_all
@@ -106,11 +107,10 @@ def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, .
         target = next(t for t in episode.targets if t.channel == "position")
         for k, joint in enumerate(target.joints):
             column = joints.index(joint)
-            slide = int(episode.replay.model.joint(joint).type[0]) == 2
             traces.append(
                 Trace(
                     joint=joint + label,
-                    unit="m" if slide else "rad",
+                    unit="m" if slides(episode.replay.model, joint) else "rad",
                     time=log.time - log.time[0],
                     command=log.channels.get(f"command.{joint}", np.full(len(log), np.nan)),
                     measured=target.measured[:, k],

@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid_btr.errors import ModelError
 from sysid_btr.models.robot import Robot
+from sysid_btr.mujoco_conventions import SINGLE
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import LINK_SUFFIX, JointAddresses, Term
 
@@ -59,10 +60,7 @@ def compile_model(
 
 def make_index(model: mujoco.MjModel) -> JointAddresses:
     """Addresses of every hinge and slide joint of the model."""
-    import mujoco
-
-    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    ids = {model.joint(i).name: i for i in range(model.njnt) if int(model.jnt_type[i]) in single}
+    ids = {model.joint(i).name: i for i in range(model.njnt) if int(model.jnt_type[i]) in SINGLE}
     joints = tuple(name for name in ids if not name.endswith(LINK_SUFFIX))
     actuator_of = {
         int(model.actuator_trnid[a, 0]): a

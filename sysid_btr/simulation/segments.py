@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.mujoco_conventions import free_joints, to_quaternion, to_rotation
 from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import write_model
@@ -71,11 +72,11 @@ class Windows:
         from scipy.spatial.transform import Rotation
 
         j = self.joint_position.shape[1]
-        turned = Rotation.from_quat(self.quaternion[:, [1, 2, 3, 0]]) * Rotation.from_rotvec(change[:, 3:6])
+        turned = to_rotation(self.quaternion) * Rotation.from_rotvec(change[:, 3:6])
         return replace(
             self,
             position=self.position + change[:, :3],
-            quaternion=np.asarray(turned.as_quat()[:, [3, 0, 1, 2]]),
+            quaternion=to_quaternion(turned),
             velocity=self.velocity + change[:, 6:9],
             rate=self.rate + change[:, 9:12],
             joint_position=self.joint_position + change[:, BASE : BASE + j],
@@ -103,11 +104,11 @@ def on_slope(starts: Windows, level: FloatArray, tilted: FloatArray) -> Windows:
     sine = np.linalg.norm(axis, axis=1)
     turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.where(sine > 0, sine, 1.0))[:, None])
     below = starts.position * [1.0, 1.0, 0.0]
-    turned = turn * Rotation.from_quat(starts.quaternion[:, [1, 2, 3, 0]])
+    turned = turn * to_rotation(starts.quaternion)
     return replace(
         starts,
         position=below + turn.apply(starts.position - below),
-        quaternion=np.asarray(turned.as_quat()[:, [3, 0, 1, 2]]),
+        quaternion=to_quaternion(turned),
         velocity=turn.apply(starts.velocity),
     )
 
@@ -304,5 +305,5 @@ class WindowReplay(Replay):
     @cached_property
     def _free_joint(self) -> tuple[int, int]:
         """Addresses of the free joint in qpos and in qvel."""
-        joint = int(np.flatnonzero(self.model.jnt_type == 0)[0])
+        joint = int(free_joints(self.model)[0])
         return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.mujoco_conventions import HINGE, SINGLE
 from sysid_btr.writeback.xmltext import number, numbers
 
 if TYPE_CHECKING:
@@ -113,8 +114,6 @@ def _dry(field: str) -> Read:
     return read
 
 
-SLIDE, HINGE = 2, 3
-SINGLE = (SLIDE, HINGE)
 
 
 def _in(model: mujoco.MjModel, i: int, angle: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.models.robot import Robot
+from sysid_btr.mujoco_conventions import FREE
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.silence import silenced
@@ -107,9 +108,7 @@ def _put(model: mujoco.MjModel, name: str, values: FloatArray) -> None:
 
 def _not_free(model: mujoco.MjModel, kind: str) -> BoolArray:
     """Rows of joints other than free ones, in a field by joint, by degree of freedom or by coordinate."""
-    import mujoco
-
-    free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
+    free = model.jnt_type == FREE
     if kind == "jnt":
         return np.asarray(~free)
     size, address, width = (model.nv, model.jnt_dofadr, 6) if kind == "dof" else (model.nq, model.jnt_qposadr, 7)

@@ -14,6 +14,7 @@ from sysid_btr.errors import ModelError, SysidError
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import Robot
+from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.result import clean, to_json
 from sysid_btr.run_folder import MODEL, PARAMS, Folder
 from sysid_btr.terms.base import Term
@@ -217,7 +218,7 @@ def _header(draft: Draft, costs: Sequence[str]) -> list[str]:
 
 
 def _floats(draft: Draft) -> bool:
-    return bool(np.any(draft.target.model.jnt_type == 0))
+    return bool(len(free_joints(draft.target.model)))
 
 
 @dataclass(frozen=True)
