@@ -213,7 +213,12 @@ def _deconvolve(
 
 
 def _pulsed(
-    episode: Episode, values: FloatArray, train: Term, rest: Sequence[float], sizes: FloatArray, members: list[list[int]]
+    episode: Episode,
+    values: FloatArray,
+    train: Term,
+    rest: Sequence[float],
+    sizes: FloatArray,
+    members: Sequence[Sequence[int]],
 ) -> Outputs:
     """Sensors without a pulse, and with pulses of given sizes at one joint of every subtree at a time.
 

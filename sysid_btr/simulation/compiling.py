@@ -60,6 +60,8 @@ def compile_model(
 
 def make_index(model: mujoco.MjModel) -> JointAddresses:
     """Addresses of every hinge and slide joint of the model."""
+    import mujoco
+
     ids = {model.joint(i).name: i for i in range(model.njnt) if int(model.jnt_type[i]) in SINGLE}
     joints = tuple(name for name in ids if not name.endswith(LINK_SUFFIX))
     actuator_of = {
