@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from benchmarks.replay import HERE, ROOT, machine
 from reference_simulator import Recording, save
 from reference_simulator.effects import CoulombFriction
+from sysid_btr.cli.close import DECLARED
 from sysid_btr.diagnosis.close import close
 from sysid_btr.executors.base import HERE as IN_PROCESS
 from sysid_btr.executors.base import Executor
@@ -29,7 +30,6 @@ from sysid_btr.executors.pool import DaskExecutor
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
-from sysid_btr.request import DECLARED
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray

@@ -37,7 +37,7 @@ TITLES = {
     "reference": "API",
 }
 """Pages in the order of the menu."""
-NOT_DOCUMENTED = ("sysid_btr.cli", "sysid_btr.demo", "sysid_btr.report.render_worker")
+NOT_DOCUMENTED = ("sysid_btr.cli", "sysid_btr.report.render_worker")
 FRAME = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark"><title>{title} - sysid_btr</title><style>
@@ -155,7 +155,7 @@ def spaced(docstring: str) -> str:
 def modules() -> list[str]:
     """Names of all public modules."""
     found = (m.name for m in pkgutil.walk_packages(sysid_btr.__path__, "sysid_btr."))
-    return ["sysid_btr", *(n for n in found if "._" not in n and n not in NOT_DOCUMENTED)]
+    return ["sysid_btr", *(n for n in found if "._" not in n and not n.startswith(NOT_DOCUMENTED))]
 
 
 def reference_page() -> str:

@@ -12,12 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from terminal import Cli
 
-from sysid_btr.cli import app, run
-from sysid_btr.config import StudyFile
-from sysid_btr.demo import cases
+from sysid_btr.cli import run
+from sysid_btr.cli.demo import cases
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
@@ -303,19 +301,6 @@ def test_study_file_gives_every_flag_and_the_command_line_wins(cli: Cli, bench: 
     over = json.loads(cli("fit", "--config", study, "--seed", "6", "--fit", "mass:arm").out)
     assert over["seed"] == 6
     assert [p["name"] for p in over["parameters"]] == ["mass:arm"]
-
-
-def test_study_file_knows_every_option_of_every_verb() -> None:
-    command = typer.main.get_command(app)
-    options = {
-        option.removeprefix("--").replace("-", "_")
-        for verb in ("replay", "fit", "posterior", "close", "btr", "excite")
-        for parameter in command.commands[verb].params
-        for option in parameter.opts
-        if option.startswith("--")
-    }
-    known = {field.alias or name for name, field in StudyFile.model_fields.items()}
-    assert options - {"config", "debug", "help"} == known
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from PIL import Image
 from terminal import Cli
 
 from sysid_btr.cli import run
-from sysid_btr.demo import sample_logs
+from sysid_btr.cli.demo import sample_logs
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log

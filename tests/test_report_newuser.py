@@ -15,7 +15,7 @@ import pytest
 from terminal import Cli
 
 import sysid_btr as sb
-from sysid_btr.demo import sample_logs
+from sysid_btr.cli.demo import sample_logs
 from sysid_btr.errors import ModelError, UsageError
 from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.io.importers.names import suggestions
@@ -234,7 +234,7 @@ def test_whatever_else_cannot_be_written_is_no_defect(
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "somewhere")
 
     monkeypatch.setattr("sysid_btr.saving.write_all", closed)
-    monkeypatch.setattr("sysid_btr.cli.write_all", closed)
+    monkeypatch.setattr("sysid_btr.cli.fitting.write_all", closed)
     answer = cli("fit", *ASKED, "--out", tmp_path / "out")
     assert answer.code == 2
     assert "cannot write somewhere: Permission denied" in answer.err

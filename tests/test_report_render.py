@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from sysid_btr.cli import run
-from sysid_btr.demo import sample_logs
+from sysid_btr.cli.demo import sample_logs
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log, write_log

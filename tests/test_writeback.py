@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sysid_btr.cli import run
-from sysid_btr.demo import sample_logs
+from sysid_btr.cli.demo import sample_logs
 from sysid_btr.diagnosis.closing import Closing
 from sysid_btr.display.changes import change_lines, model_lines
 from sysid_btr.errors import UsageError
@@ -642,7 +642,7 @@ def test_effects_read_back_too(own: Path, out: Folder) -> None:
     assert [type(m) for m in params.model.terms] == [Backlash, Payload]
     assert params.by_name["payload.mass:hip"] == 0.1
     given, unused = starts_from(params, effects[0].parameters)
-    assert given == ["backlash.play:knee=0.02", "backlash.softness:knee=0.001"]
+    assert given == {"backlash.play:knee": 0.02, "backlash.softness:knee": 0.001}
     assert len(unused) == 5
 
 

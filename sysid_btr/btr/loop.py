@@ -237,6 +237,7 @@ def back_to_reality(
     threads: int = 0,
     progress: Progress = silent,
     say: Callable[[str], None] = quiet,
+    fingerprint: str = "",
 ) -> BackToReality:
     """Find a controller that works on the robot, and a model that says so.
 
@@ -250,6 +251,7 @@ def back_to_reality(
     folder : where journals and trials are kept; a run that finds its own goes on with them. None keeps nothing.
     threads : worker threads, 0 for all cores.
     progress, say : told of evaluations, and of what was found.
+    fingerprint : of what else decides which simulations are run: the robot, of which nothing is known here.
 
     Raises
     ------
@@ -261,7 +263,7 @@ def back_to_reality(
     if not terms:
         raise UsageError("nothing of the model is unknown: name what the trials may correct (--fit)")
     settings = Settings() if settings is None else settings
-    loop = _Loop(model, robot, space, task, settings, seed, folder, threads, progress, say, tuple(terms))
+    loop = _Loop(model, robot, space, task, settings, seed, folder, threads, progress, say, tuple(terms), fingerprint)
     return loop.go()
 
 
@@ -280,6 +282,7 @@ class _Loop:
     progress: Progress
     say: Callable[[str], None]
     terms: tuple[Term, ...]
+    fingerprint: str = ""
     simulations: int = 0
 
     def __post_init__(self) -> None:
@@ -304,6 +307,7 @@ class _Loop:
         parameters = [(p.name, p.nominal, p.lower, p.upper) for p in self.stage.parameters]
         bounds = [self.space.lower.tolist(), self.space.upper.tolist(), self.space.start.tolist()]
         content = [__version__, self.model.digest, parameters, bounds, repr(self.task), repr(settings), self.seed]
+        content.append(self.fingerprint)
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def go(self) -> BackToReality:

@@ -119,14 +119,15 @@ def _parameter(entry: Mapping[str, Any]) -> Parameter:
     )
 
 
-def starts_from(params: Params, parameters: Sequence[Parameter]) -> tuple[list[str], list[str]]:
-    """``NAME=VALUE`` for the parameters that are free here, and the names of those that are not."""
+def starts_from(params: Params, parameters: Sequence[Parameter]) -> tuple[dict[str, float], list[str]]:
+    """Values of the parameters that are free here, and the names of those that are not."""
     free = {p.name: p for p in parameters}
-    given, unused = [], []
+    given: dict[str, float] = {}
+    unused = []
     for name, value in params.by_name.items():
         if name in free:
             p = free[name]
-            given.append(f"{name}={min(max(value, p.lower), p.upper)!r}")
+            given[name] = min(max(value, p.lower), p.upper)
         else:
             unused.append(name)
     return given, unused

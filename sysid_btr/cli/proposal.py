@@ -1,17 +1,20 @@
-"""The study file to begin with: what a log holds, and which parameters of the model it may tell."""
+"""The study file to begin with: what a log holds, and which parameters of the model may be identifiable."""
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.cli.fit import FitOptions
+from sysid_btr.cli.options import Option, options_of
+from sysid_btr.cli.study_file import toml
 from sysid_btr.errors import ModelError, UsageError
 from sysid_btr.io.log import CHANNELS, Log
 from sysid_btr.models.robot import Robot, joint_names, servo_actuators
@@ -24,7 +27,7 @@ from sysid_btr.units import si
 if TYPE_CHECKING:
     import mujoco
 
-HOLDOUT = 0.3
+OPTIONS = options_of(FitOptions)
 MOVED = {"rad": 0.02, "m": 0.001}
 """Less motion than this is within friction's dead band and a few encoder steps."""
 WIDTH = 34
@@ -91,6 +94,7 @@ def study_file(robot: Robot, logs: Sequence[Log], model: str, out: Path | None =
         f"#   sysid-btr fit   --config {_shown(out)}     # fits the parameters listed under `fit`",
         f"#   sysid-btr close --config {_shown(out)}     # the same, then names what the model is missing",
         "# Every line may be changed; a flag at the command line wins over its line here.",
+        "# Files are looked for beside this file first.",
     ]
     for log, joints in zip(logs, seen, strict=True):
         lines += ["", *_what_the_log_holds(log, joints)]
@@ -172,44 +176,41 @@ def _settings(robot: Robot, logs: Sequence[Log], model: str, folder: Path | None
     named = _near(Path(model), folder) if robot.path is not None else model
     paths = [_near(log.path, folder) for log in logs if log.path is not None]
     channels = [c for c in FITTED if any(log.has(c, j) for log in logs for j in joint_names(robot))]
-    yield "# The model: a built-in robot, or an MJCF or URDF file. Files are looked for beside this file first."
-    yield f"model = {_text(named)}"
-    yield "# The recordings to fit; several are fitted together."
-    yield f"log = {_text(paths)}"
-    yield f"# Not fitted, but predicted, to judge the fit: the last {HOLDOUT:.0%} of each log, or files of their own."
-    yield f"holdout = {HOLDOUT}"
-    yield f"# What is compared while fitting: of {', '.join(COMPARED)}, as far as it is logged."
-    yield f"channels = {_text(channels)}"
-    yield "# Of all random numbers: the same seed gives the same answer."
-    yield "seed = 0"
-    yield "# How `fit` searches: lsq (least squares) is quick and gives intervals; ga, cmaes, nlopt:NAME look further."
-    yield 'estimator = "lsq"'
-    yield "# Where result.json, report.html and the journal go; without it results are only printed."
-    yield '# out = "out"'
+    proposed = {"model": named, "log": paths, "channels": channels}
+    for name in ("model", "log", "holdout", "channels", "seed", "estimator", "out"):
+        option = OPTIONS[name]
+        yield from _comment(option)
+        value = proposed.get(name, option.default)
+        yield f"# {name} = {toml(name)}" if value is None else f"{name} = {toml(value)}"
+
+
+def _comment(option: Option) -> list[str]:
+    return wrap(option.help, 116, initial_indent="# ", subsequent_indent="# ")
 
 
 def _parameters(robot: Robot, model: mujoco.MjModel, moving: Sequence[str], free: bool) -> Iterator[str]:
-    yield "# Parameters to find: FIELD:NAME, with * for any, and =shared for one common value. Masses and gains are"
-    yield "# factors of the model's own value. What the log cannot tell is said so in the result, with the reason."
+    yield from _comment(OPTIONS["fit"])
+    yield "# Masses and gains are factors of the model's own value; =shared is one common value. The result says which"
+    yield "# parameters are not identifiable, and why."
     chosen = list(_from_table(robot)) or [*_masses(model, moving, free), *_gains(model, moving)]
     if not chosen:
         chosen = [("mass:*", "all masses: no joint moved enough to choose among them")]
     yield "fit = ["
     for expression, reason in chosen:
-        yield f"    {_text(expression) + ',':{WIDTH}}  # {reason}"
+        yield f"    {toml(expression) + ',':{WIDTH}}  # {reason}"
     yield "]"
     yield "# Also possible, one line each in the list above:"
     for expression, reason in _others(moving):
-        yield f"#     {_text(expression) + ',':{WIDTH - 2}}  # {reason}"
+        yield f"#     {toml(expression) + ',':{WIDTH - 2}}  # {reason}"
     yield ""
-    yield "# Between which values each parameter is sought, by name or for a whole field."
+    yield from _comment(OPTIONS["bounds"])
     yield "[bounds]"
     terms = Terms(parse_parameters([expression for expression, _ in chosen], robot))
     shown = {}
     for parameter in terms.parameters:
         shown[parameter.name.partition(":")[0]] = (parameter.lower, parameter.upper)
     for field, (low, high) in shown.items():
-        yield f"# {_text(field)} = [{low:g}, {high:g}]"
+        yield f"# {toml(field)} = [{low:g}, {high:g}]"
 
 
 def _from_table(robot: Robot) -> Iterator[tuple[str, str]]:
@@ -283,8 +284,3 @@ def _near(path: Path, folder: Path | None) -> str:
         return str(path)
     relative = os.path.relpath(path.resolve(), folder.resolve())
     return relative if relative.count("..") <= 1 else str(path.resolve())
-
-
-def _text(value: str | Sequence[str]) -> str:
-    """A TOML string or list of strings; JSON has the same escapes, but for DEL."""
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

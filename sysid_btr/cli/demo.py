@@ -1,4 +1,4 @@
-"""What `sysid-btr demo` runs: a sample log that ships with the package, and a measured one if at hand."""
+"""``sysid-btr demo``: a sample log that ships with the package, and a measured one if at hand."""
 
 from __future__ import annotations
 
@@ -6,9 +6,33 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from sysid_btr.cli.close import CloseOptions, close
+from sysid_btr.cli.groups import ThreadOptions
+from sysid_btr.cli.options import option
+from sysid_btr.cli.terminal import remark
 from sysid_btr.errors import UsageError
 
-PACKAGE = Path(__file__).resolve().parent
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(ThreadOptions):
+    """Options of `demo`."""
+
+    out: Path = option(Path("demo_out"), "Folder of the reports.", short="-o", metavar="DIR", decides=False)
+
+
+def demo(options: DemoOptions) -> int:
+    """One minute: close the loop on a sample log whose robot has something that its model lacks.
+
+    And on a measured log, where the recordings are at hand (SYSID_BTR_DATA).
+    """
+    for case in cases():
+        remark(f"\n== {case.title}\n$ {case.command(options.out)}")
+        code = close(case.options(options))
+        if code:
+            return code
+    return 0
 
 
 @dataclass(frozen=True)
@@ -25,6 +49,17 @@ class Case:
         """The same at a shell."""
         free = " ".join(f"--fit '{p}'" for p in self.free)
         return f"sysid-btr close --model {self.model} --log {self.log} {free} --out {out / self.name}"
+
+    def options(self, asked: DemoOptions) -> CloseOptions:
+        """The same from Python."""
+        return CloseOptions(
+            model=self.model,
+            log=(self.log,),
+            fit=self.free,
+            threads=asked.threads,
+            out=asked.out / self.name,
+            overwrite=True,
+        )
 
 
 def cases() -> tuple[Case, ...]:

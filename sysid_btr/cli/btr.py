@@ -1,0 +1,243 @@
+"""``sysid-btr btr``: from names to robots, and from what was found to files."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from sysid_btr.cli.fitting import fingerprint
+from sysid_btr.cli.groups import (
+    JsonOptions,
+    ModelOptions,
+    OutOptions,
+    ParameterOptions,
+    SeedOptions,
+    ThreadOptions,
+)
+from sysid_btr.cli.inputs import check_freed, find_robot
+from sysid_btr.cli.kinds import Numbers
+from sysid_btr.cli.options import option
+from sysid_btr.cli.terminal import print_result, remark
+from sysid_btr.errors import InterruptedRun, UsageError
+from sysid_btr.progress import Interrupted, ProgressLine
+from sysid_btr.run_folder import OVERLAY, RESULT, Folder, open_folder
+
+if TYPE_CHECKING:
+    from sysid_btr.btr.controllers import ControllerSpace
+    from sysid_btr.btr.loop import Settings
+    from sysid_btr.btr.robot import Robot
+    from sysid_btr.btr.task import Walk
+    from sysid_btr.estimators.base import Estimator
+    from sysid_btr.models.robot import Robot as Model
+
+KEPT = ("journals", "trials", "closings")
+"""Folders of a run beside its results."""
+DURATIONS, LONG = {"ant": 3.0}, 8.0
+"""s of a trial by robot, and of any other."""
+BY_FITNESS, BY_SENSORS = 12, 2
+"""Trials of an iteration where models are judged by fitness, and where by sensors (the paper's m)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, OutOptions, JsonOptions):
+    """Options of `btr`."""
+
+    robot_sim: str | None = option(
+        None,
+        "Simulation that stands for the robot; the search does not see it.",
+        metavar="NAME|FILE",
+        beside=True,
+        decides=True,
+    )
+    robot_set: Numbers = option(
+        {},
+        "Change that simulation, e.g. 'mass:*=1.1'.",
+        metavar="PARAMETERS=VALUE",
+        decides=True,
+    )
+    exchange: Path | None = option(
+        None,
+        "Folder to exchange files with a real robot: commands to play appear in it, recordings are waited for.",
+        metavar="DIR",
+        decides=False,
+    )
+    wait: float | None = option(
+        None, "Maximum time to wait for a recording.", otherwise="no limit", metavar="S", decides=False
+    )
+    iterations: int = option(13, "Maximum number of iterations.", metavar="N", least=1, decides=False)
+    trials: int | None = option(
+        None,
+        "Number of trials on the robot in each iteration.",
+        otherwise="12; 2 without phi1",
+        metavar="N",
+        least=1,
+        decides=True,
+    )
+    duration: float | None = option(
+        None, "Length of a trial.", otherwise="3 for the ant, else 8", metavar="S", decides=True
+    )
+    distance: str = option(
+        "phi1",
+        "How models are compared with the robot: phi1, phi2[:BINS], mse, wasserstein, likelihood.",
+        metavar="NAME",
+        decides=True,
+    )
+    choice: str = option(
+        "fittest",
+        "How trials are chosen: fittest, or disagreement (among models).",
+        metavar="NAME",
+        decides=True,
+    )
+    search: str = option(
+        "ga", "How controllers are searched for: ga (the paper) or cmaes.", metavar="NAME", decides=True
+    )
+    model_search: str | None = option(
+        None,
+        "How models are searched for: cmaes, ga (the paper), or lsq, which uses the first 2 s of the trials.",
+        otherwise="lsq for a likelihood, else cmaes",
+        metavar="NAME",
+        decides=True,
+    )
+    requirement: float | None = option(None, "Stop once the robot walks this fast.", metavar="M/S", decides=False)
+    close: bool = option(False, "Look for missing effects where no model explains the robot's logs.", decides=True)
+
+
+def btr(options: BtrOptions) -> int:
+    """Back to Reality: search a controller in the model, try it on the robot, correct the model by that, again.
+
+    The robot is a simulation that the search does not see (--robot-sim), or a real one behind a folder (--exchange).
+    Exit 5 if model and robot lost hold of each other; the results are written all the same.
+    """
+    from sysid_btr.btr.controllers import get_space
+    from sysid_btr.btr.loop import back_to_reality
+    from sysid_btr.btr.result import btr_result
+    from sysid_btr.btr.task import Walk
+    from sysid_btr.result import exit_code
+    from sysid_btr.terms.grammar import parse_parameters
+
+    model = find_robot(options.model, options.bounds)
+    check_freed(model, options.fit)
+    if options.resume and options.out is None:
+        raise UsageError("--resume goes on with the journals of an earlier run: give its --out folder")
+    space = get_space(model.name)
+    duration = DURATIONS.get(model.name, LONG) if options.duration is None else options.duration
+    if not duration >= 1:
+        raise UsageError(f"--duration {duration:g}: a trial needs a second at least")
+    task, settings = Walk(duration), settings_of(options, space)
+    terms, robot = parse_parameters(options.fit, model), robot_of(options, model, task, space)
+    folder = None if options.out is None else _open(options.out, options.resume, options.overwrite)
+    began = perf_counter()
+    with ProgressLine("btr") as progress:
+        try:
+            outcome = back_to_reality(
+                model,
+                terms,
+                robot,
+                space,
+                task=task,
+                settings=settings,
+                seed=options.seed,
+                folder=None if folder is None else folder.path,
+                threads=options.threads,
+                progress=progress,
+                say=remark,
+                fingerprint=fingerprint("btr", options, model),
+            )
+        except Interrupted:
+            where = "nothing is kept without --out" if folder is None else f"what is done is kept in {folder.path}"
+            more = "" if folder is None else ": the same command with --resume goes on from there"
+            raise InterruptedRun(f"interrupted; {where}{more}") from None
+    result = btr_result(outcome, wall_s=perf_counter() - began)
+    if folder is not None:
+        _write(folder, result)
+    print_result(result, options.json)
+    return exit_code(result)
+
+
+def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
+    """How the loop searches."""
+    from sysid_btr.btr.loop import (
+        LIKELIHOOD,
+        Settings,
+        cma_controller_searches,
+        controller_search,
+        model_search,
+        papers_model_search,
+    )
+    from sysid_btr.btr.map_problem import model_fit
+
+    models: dict[str, Estimator] = {"cmaes": model_search(), "ga": papers_model_search(), "lsq": model_fit()}
+    by_distance = "lsq" if options.distance == LIKELIHOOD else "cmaes"
+    search = by_distance if options.model_search is None else options.model_search
+    if options.search not in ("ga", "cmaes"):
+        raise UsageError(f"--search {options.search}: there are ga and cmaes")
+    if search not in models:
+        raise UsageError(f"--model-search {search}: there are {', '.join(models)}")
+    trials = options.trials or (BY_FITNESS if options.distance == "phi1" else BY_SENSORS)
+    settings = Settings(
+        iterations=options.iterations,
+        trials=trials,
+        controllers=controller_search(len(space.names)),
+        models=models[search],
+        distance=options.distance,
+        choice=options.choice,
+        memory=max(trials, 4),
+        requirement=options.requirement,
+        close=options.close,
+    )
+    if options.search == "cmaes":
+        first, controllers = cma_controller_searches()
+        settings = replace(settings, first=first, controllers=controllers)
+    return settings
+
+
+def robot_of(options: BtrOptions, model: Model, task: Walk, space: ControllerSpace) -> Robot:
+    """What the controllers are tried on."""
+    from sysid_btr.btr.exchange import FolderExchange
+    from sysid_btr.btr.robot import HiddenRobot, Noise
+    from sysid_btr.btr.world import make_world
+    from sysid_btr.identify.replay import set_parameters
+    from sysid_btr.models.builtin import load_robot
+
+    if (options.robot_sim is None) == (options.exchange is None):
+        raise UsageError(
+            "which robot? Give --robot-sim with a simulation that stands for it, or --exchange with the folder of "
+            "a real one"
+        )
+    if options.exchange is not None:
+        if options.robot_set:
+            raise UsageError("--robot-set changes a --robot-sim; a real robot is what it is")
+        return FolderExchange(options.exchange, task, space, model.name, patience=options.wait, say=remark)
+    hidden = load_robot(str(options.robot_sim))
+    truth = set_parameters(hidden, options.robot_set)
+    world = make_world(hidden, task, truth.terms, threads=1)
+    return HiddenRobot(world, truth.values, task, space, Noise(), options.seed)
+
+
+def _write(folder: Folder, result: dict[str, Any]) -> None:
+    """Write figures, report and, last, result.json."""
+    from sysid_btr.report.btr import plot_btr
+    from sysid_btr.report.figures import figure_of
+    from sysid_btr.report.pictures import keep, write_report
+    from sysid_btr.result import to_json
+
+    result["pictures"] = keep(folder, [(Path(OVERLAY).stem, lambda: figure_of(plot_btr(result)))])
+    remark(f"report: {write_report(folder, result)}")
+    folder.write(RESULT, to_json(result))
+
+
+def _open(out: Path, resume: bool, overwrite: bool) -> Folder:
+    there = [out / name for name in KEPT if (out / name).is_dir()]
+    if there and not (resume or overwrite):
+        raise UsageError(
+            f"--out {out} holds another run ({', '.join(p.name for p in there)}) and it is not touched: --resume goes "
+            "on with it, --overwrite replaces it, or choose another folder"
+        )
+    folder = open_folder(out, resume=resume, overwrite=overwrite)
+    if overwrite:
+        for path in there:
+            shutil.rmtree(path)
+    return folder

@@ -1,0 +1,181 @@
+"""Options that several verbs share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sysid_btr.cli.kinds import Holdout, Names, Numbers, Ranges
+from sysid_btr.cli.options import Options, RunOptions, option
+
+HOLDOUT = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(Options):
+    """The model."""
+
+    model: str | None = option(
+        None,
+        "Built-in robot, or an MJCF or URDF file.",
+        short="-m",
+        metavar="NAME|FILE",
+        beside=True,
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogOptions(Options):
+    """Recordings."""
+
+    log: tuple[Path, ...] = option((), "Recorded log (Parquet).", short="-l", metavar="FILE", beside=True, decides=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParameterOptions(Options):
+    """Which parameters of the model are free, and where."""
+
+    fit: tuple[str, ...] = option(
+        (),
+        "Parameters to fit, e.g. mass:*Knee* or kp:*=shared.",
+        short="-f",
+        metavar="FIELD:GLOB[,GLOB..][=shared]",
+        decides=True,
+    )
+    bounds: Ranges = option(
+        {},
+        "Bounds of a parameter or of a whole field, e.g. kp=0.5:2.",
+        metavar="NAME=LOW:HIGH",
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParamsOptions(Options):
+    """An earlier run."""
+
+    params: Path | None = option(
+        None,
+        "params.json of an earlier run, or its folder: start from its values (replay: use them, effects included).",
+        metavar="FILE",
+        beside=True,
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions(ModelOptions, LogOptions, ParameterOptions, ParamsOptions):
+    """What is fitted to what: shared by `fit`, `posterior` and `close`."""
+
+    holdout: Holdout = option(
+        HOLDOUT,
+        "Logs that are not fitted but predicted, or the last fraction of each log.",
+        metavar="FILE|FRACTION",
+        beside=True,
+        decides=True,
+    )
+    channels: Names = option(
+        (),
+        "Channels to fit: position, velocity, effort.",
+        otherwise="position and effort where logged",
+        metavar="NAME[,NAME..]",
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(Options):
+    """How the best values are searched for."""
+
+    start: Numbers = option(
+        {},
+        "Initial value of a parameter, by name or glob, e.g. mass:slider=0.7.",
+        metavar="NAME=VALUE",
+        decides=True,
+    )
+    estimator: str = option(
+        "lsq",
+        "How the values are searched for: lsq, ga, cmaes, nlopt:ALGORITHM, emcee, or an installed estimator; joined by "
+        "+, each starts from the best of the one before (cmaes+lsq).",
+        metavar="NAME[+NAME..]",
+        decides=True,
+    )
+    distance: str = option(
+        "likelihood",
+        "What is minimised: likelihood (squares over noise); or mse, phi1, phi2[:BINS], wasserstein, with ga, cmaes or "
+        "nlopt.",
+        metavar="NAME",
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThreadOptions(RunOptions):
+    """What this process uses."""
+
+    threads: int = option(0, "Worker threads; 0 for all cores.", metavar="N", least=0, decides=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeedOptions(RunOptions):
+    """What a search uses."""
+
+    seed: int = option(0, "Random seed.", metavar="N", least=0, decides=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutorOptions(RunOptions):
+    """What a search uses that can run on many machines."""
+
+    executor: str | None = option(
+        None,
+        "Simulate on the workers of a dask cluster, or on N one-thread worker processes; the results are the same.",
+        otherwise="threads of this process",
+        metavar="tcp://HOST:PORT|local[:N]",
+        decides=False,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class JsonOptions(RunOptions):
+    """What is printed."""
+
+    json: bool = option(False, "Print result.json instead of tables.", decides=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutOptions(RunOptions):
+    """What is kept of a run."""
+
+    out: Path | None = option(
+        None,
+        "Folder for result.json, model.xml, params.json, overlay.png, report.html and the journal. Without it nothing "
+        "is written: results are only printed.",
+        short="-o",
+        metavar="DIR",
+        decides=False,
+    )
+    resume: bool = option(False, "Continue an interrupted run with the same --out.", decides=False)
+    overwrite: bool = option(False, "Replace earlier results in --out.", decides=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions(RunOptions):
+    """What is kept of a run that changes a model."""
+
+    render: bool = option(
+        False,
+        "Also draw log, model before and model after, side by side: render.png and render.gif.",
+        decides=False,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittingOptions(StudyOptions, SeedOptions, ThreadOptions, ExecutorOptions, OutOptions, RenderOptions, JsonOptions):
+    """What `fit`, `posterior` and `close` have in common."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchingOptions(FittingOptions, SearchOptions):
+    """What `fit` and `posterior` have in common."""

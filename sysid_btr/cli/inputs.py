@@ -1,0 +1,184 @@
+"""From names and files to robots, logs and initial values; what cannot be used is refused before any work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sysid_btr.cli.kinds import Holdout, Ranges
+from sysid_btr.cli.terminal import remark
+from sysid_btr.errors import LogError, UsageError
+
+if TYPE_CHECKING:
+    from sysid_btr._typing import FloatArray
+    from sysid_btr.io.log import Log
+    from sysid_btr.models.robot import Robot
+    from sysid_btr.terms.base import Parameter
+
+
+def find_robot(name: str | None, bounds: Ranges | None = None) -> Robot:
+    """The robot called for, with the bounds given to its parameters."""
+    from dataclasses import replace
+
+    from sysid_btr.models.builtin import BUILTIN, load_robot
+
+    if name is None:
+        built_in = f" ({', '.join(sorted(BUILTIN))})" if BUILTIN else ""
+        raise UsageError(f"which robot? Give --model: a built-in name{built_in} or an MJCF or URDF file")
+    robot = load_robot(name)
+    if not bounds:
+        return robot
+    _check_names(robot, bounds)
+    return replace(robot, bounds={**robot.bounds, **bounds})
+
+
+def _check_names(robot: Robot, bounds: Iterable[str]) -> None:
+    """Refuse bounds of what no parameter of the robot is called."""
+    from sysid_btr.terms.grammar import check_expression
+
+    problems = []
+    for name in bounds:
+        try:
+            check_expression(name, robot)
+        except UsageError as error:
+            problems.append(f"--bounds {name}: {error}")
+    if problems:
+        raise UsageError("\n".join(problems))
+
+
+def read_logs(paths: Iterable[Path], *, motions: bool = False) -> list[Log]:
+    """All logs, or one error that lists what is wrong with each of them.
+
+    A motion that nobody has recorded yet counts as wrong, unless `motions` are wanted.
+    """
+    from sysid_btr.io.parquet import read_log
+
+    logs, problems = [], []
+    for path in paths:
+        try:
+            log = read_log(path)
+        except LogError as error:
+            problems.append(str(error))
+            continue
+        if log.is_motion and not motions:
+            problems.append(
+                f"{path} is a motion to be played, not a recording: play it on the robot, and give the log of what its "
+                "sensors said"
+            )
+        logs.append(log)
+    if problems:
+        raise LogError("\n".join(problems))
+    if not logs:
+        raise UsageError("which log? Give --log FILE, once for each log")
+    return logs
+
+
+def read_holdout(given: Holdout) -> float | list[Log]:
+    """The fraction, or the logs, that are not fitted."""
+    return read_logs(given) if isinstance(given, tuple) else given
+
+
+def warn_of(robot: Robot, logs: Iterable[Log]) -> None:
+    """Remarks of the validation on logs that can be used all the same."""
+    from sysid_btr.io.validation import validate_log
+    from sysid_btr.models.robot import joint_names, joint_ranges
+
+    for log in logs:
+        for problem in validate_log(log, joints=joint_names(robot), ranges=joint_ranges(robot)):
+            remark(f"warning: {log.path}: {problem.where}: {problem.message} [{problem.code}]\n    -> {problem.remedy}")
+
+
+def check_channels(names: Sequence[str]) -> None:
+    """Refuse channels that a replay does not predict."""
+    from sysid_btr.objectives.targets import COMPARED
+
+    unknown = [name for name in names if name not in COMPARED]
+    if unknown:
+        raise UsageError(f"--channels: unknown {', '.join(unknown)}; a replay predicts {', '.join(COMPARED)}")
+
+
+def check_freed(robot: Robot, fit: Sequence[str]) -> None:
+    """Refuse a fit of nothing, with every field of the grammar and the names it can be freed at."""
+    if not fit:
+        raise UsageError(_what_can_be_freed(robot))
+
+
+def _what_can_be_freed(robot: Robot) -> str:
+    from sysid_btr.models.robot import body_names, joint_names, servo_joints
+    from sysid_btr.terms.fields import FIELDS
+
+    fields: dict[str, list[str]] = {}
+    for name, cls in {**FIELDS, **robot.fields}.items():
+        fields.setdefault(cls.scope, []).append(name)
+    lines = [
+        f"what shall be fitted? Give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has",
+    ]
+    for scope, names in (
+        ("body", body_names(robot)),
+        ("joint", joint_names(robot)),
+        ("servo", servo_joints(robot)),
+    ):
+        noun = {"body": "bodies", "joint": "joints", "servo": "joints with a servo"}[scope]
+        lines.append(f"  {', '.join(fields.get(scope, []))}\n    of {noun}: {', '.join(names) or 'none'}")
+    lines.append("for example: --fit 'mass:*' --fit 'kp:*=shared'")
+    return "\n".join(lines)
+
+
+def initial_values(
+    parameters: Sequence[Parameter], robot: Robot, params: Path | None, start: Mapping[str, float] | None = None
+) -> FloatArray:
+    """Where a search begins: nominal values, but for those of an earlier run, and for those given by name or glob.
+
+    Raises
+    ------
+    UsageError
+        For names that no free parameter has, and values outside the bounds; all of them at once.
+    """
+    from fnmatch import fnmatchcase
+
+    import numpy as np
+
+    values = np.array([p.nominal for p in parameters])
+    problems = []
+    for name, value in [*_known(params, robot, parameters).items(), *(start or {}).items()]:
+        chosen = [i for i, p in enumerate(parameters) if p.name == name] or [
+            i for i, p in enumerate(parameters) if fnmatchcase(p.name, name)
+        ]
+        if not chosen:
+            problems.append(f"{name} is not a free parameter; there are {', '.join(p.name for p in parameters)}")
+        for i in chosen:
+            p = parameters[i]
+            if not p.lower <= value <= p.upper:
+                problems.append(f"{p.name}={value:g} is outside its bounds {p.lower:g} to {p.upper:g}")
+            values[i] = value
+    if problems:
+        raise UsageError("--start: " + "\n  ".join(problems))
+    return values
+
+
+def _known(path: Path | None, robot: Robot, parameters: Sequence[Parameter]) -> Mapping[str, float]:
+    """Values of a parameter file, for what is free; says which of its values are not used."""
+    if path is None:
+        return {}
+    from sysid_btr.writeback.params import read_params, starts_from
+
+    given, unused = starts_from(read_params(path, robot), parameters)
+    if unused:
+        remark(f"--params: not free here, and so not used: {', '.join(unused)}")
+    return given
+
+
+def output_file(out: Path | None, sources: Sequence[Path], overwrite: bool) -> Path | None:
+    """The one file that a verb writes; refused before any work if something is in the way."""
+    if out is None:
+        return None
+    if out.is_dir():
+        raise UsageError(f"--out {out} is a folder; give the name of a file in it")
+    if any(out.exists() and source.exists() and out.samefile(source) for source in sources):
+        raise UsageError(f"--out {out} is also read, and is not overwritten; choose another name")
+    if out.exists() and not overwrite:
+        raise UsageError(f"--out {out} exists; --overwrite replaces it, or choose another name")
+    if not out.parent.is_dir():
+        raise UsageError(f"--out {out}: the folder {out.parent} does not exist; create it first")
+    return out

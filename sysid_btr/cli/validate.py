@@ -1,0 +1,52 @@
+"""``sysid-btr validate``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from sysid_btr.cli.groups import JsonOptions, LogOptions, ModelOptions
+from sysid_btr.cli.options import argument
+from sysid_btr.cli.terminal import print_json
+from sysid_btr.errors import LogError, UsageError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidateOptions(LogOptions, ModelOptions, JsonOptions):
+    """Options of `validate`."""
+
+    files: tuple[Path, ...] = argument((), "Logs to check.", metavar="[FILE]...")
+
+
+def validate(options: ValidateOptions) -> int:
+    """Say everything that is wrong with a log, where, and what to do about it (exit 3 on errors)."""
+    from sysid_btr.io.problem import errors_of
+    from sysid_btr.io.validation import validate_file
+    from sysid_btr.models.builtin import load_robot
+    from sysid_btr.models.robot import joint_names, joint_ranges
+
+    paths = [*options.files, *options.log]
+    if not paths:
+        raise UsageError("which log? Give one or more files: sysid-btr validate walk.parquet")
+    robot = None if options.model is None else load_robot(options.model)
+    joints = None if robot is None else joint_names(robot)
+    ranges = None if robot is None else joint_ranges(robot)
+    found = {path: validate_file(path, joints=joints, ranges=ranges) for path in paths}
+    if options.json:
+        print_json({str(path): problems for path, problems in found.items()})
+    else:
+        from sysid_btr.display.text import console, problems_table
+
+        out = console(sys.stdout)
+        for path, problems in found.items():
+            errors = len(errors_of(problems))
+            warnings = len(problems) - errors
+            out.print(f"{path}: {_count(errors, 'error')}, {_count(warnings, 'warning')}")
+            if problems:
+                out.print(problems_table(problems))
+    return LogError.exit_code if any(errors_of(problems) for problems in found.values()) else 0
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
