@@ -45,10 +45,10 @@ from sysid_btr.identify.replay import set_parameters
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import servo_joints
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.command_delay import CommandDelay
-from sysid_btr.terms.coulomb_friction import CoulombFriction
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.servo import CommandDelay
 
 TASK = Walk(8.0)
 FREE = (*(f"mass:{place}=shared" for place in V32), "kp:*=shared", "kv:*=shared")

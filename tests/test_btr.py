@@ -39,10 +39,10 @@ from sysid_btr.result import to_json
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import BatchModel, Term
-from sysid_btr.terms.command_delay import CommandDelay
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Model, Terms
+from sysid_btr.terms.servo import CommandDelay
 
 MODEL = load_robot("ant")
 TASK = Walk(1.0)

@@ -24,26 +24,16 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.armature import Armature
-from sysid_btr.terms.backlash import Backlash
-from sysid_btr.terms.com_offset import ComOffset
-from sysid_btr.terms.command_delay import CommandDelay
-from sysid_btr.terms.constant_force import ConstantForce
-from sysid_btr.terms.coulomb_friction import CoulombFriction
+from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.encoder_offset import EncoderOffset
-from sysid_btr.terms.gravity_tilt import GravityTilt
-from sysid_btr.terms.integral_gain import IntegralGain
-from sysid_btr.terms.joint_compliance import JointCompliance
-from sysid_btr.terms.joint_spring import JointSpring
+from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, ViscousDamping
+from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
+from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.model import Model
-from sysid_btr.terms.payload import Payload
-from sysid_btr.terms.quadratic_damping import QuadraticDamping
-from sysid_btr.terms.sensor_delay import SensorDelay
-from sysid_btr.terms.slew_limit import SlewLimit
-from sysid_btr.terms.speed_torque_limit import SpeedTorqueLimit
-from sysid_btr.terms.torque_limit import TorqueLimit
-from sysid_btr.terms.viscous_damping import ViscousDamping
+from sysid_btr.terms.sensing import EncoderOffset, SensorDelay
+from sysid_btr.terms.servo import CommandDelay, IntegralGain
+from sysid_btr.terms.spring import JointSpring
+from sysid_btr.terms.transmission import Backlash, JointCompliance
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 GAINS = ("kp:*=shared", "kv:*=shared")

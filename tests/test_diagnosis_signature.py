@@ -25,17 +25,17 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.emps import emps
-from sysid_btr.terms.cogging import Cogging
-from sysid_btr.terms.coulomb_friction import CoulombFriction
-from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.external_disturbance import (
+from sysid_btr.terms.disturbance import (
     DriveDisturbanceTrain,
     ExternalDisturbance,
     ExternalDisturbanceTrain,
     pulses,
 )
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.library import EFFECTS
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.transmission import Cogging
 
 NOISE = 4e-4
 """rad, of a position sensor."""

@@ -36,10 +36,9 @@ from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps, step_
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.start import initial_state
-from sysid_btr.terms.coulomb_friction import CoulombFriction
+from sysid_btr.terms.friction import CoulombFriction, StribeckFriction
 from sysid_btr.terms.grammar import parse_parameters
-from sysid_btr.terms.integral_gain import IntegralGain
-from sysid_btr.terms.stribeck_friction import StribeckFriction
+from sysid_btr.terms.servo import IntegralGain
 
 ARM = ("arm",)
 ZERO = np.zeros(1)

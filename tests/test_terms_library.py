@@ -11,9 +11,9 @@ from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.joint_compliance import JointCompliance
 from sysid_btr.terms.library import EFFECTS, effect_names, select_effects
 from sysid_btr.terms.scales import Scales
+from sysid_btr.terms.transmission import JointCompliance
 
 LOG = swing(LEG_JOINTS, seconds=0.8)
 SCALES: Scales = dict.fromkeys(LEG_JOINTS, SCALE)

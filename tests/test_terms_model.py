@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.coulomb_friction import CoulombFriction
 from sysid_btr.terms.fields import Com, Kp, Mass
+from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model, Terms, as_model
 
 KINDS = (Mass, Com, Kp, CoulombFriction)

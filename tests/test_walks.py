@@ -41,13 +41,12 @@ from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows, on_slope
-from sysid_btr.terms.command_delay import CommandDelay
-from sysid_btr.terms.constant_force import ConstantForce
+from sysid_btr.terms.contact import FootCompliance, FootFriction
+from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.foot_compliance import FootCompliance
-from sysid_btr.terms.foot_friction import FootFriction
 from sysid_btr.terms.grammar import parse_parameters
-from sysid_btr.terms.gravity_tilt import GravityTilt
+from sysid_btr.terms.inertial import GravityTilt
+from sysid_btr.terms.servo import CommandDelay
 
 FINE = Numerics("RK4", 0.001)
 LENGTH = 10

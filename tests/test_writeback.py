@@ -32,22 +32,18 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
 from sysid_btr.run_folder import Folder
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.backlash import Backlash
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.command_delay import CommandDelay
-from sysid_btr.terms.constant_force import ConstantForce
-from sysid_btr.terms.coulomb_friction import CoulombFriction
+from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.encoder_offset import EncoderOffset, EncoderOffsetInLoop
+from sysid_btr.terms.friction import CoulombFriction, LoadFriction
 from sysid_btr.terms.grammar import parse_parameters
-from sysid_btr.terms.gravity_tilt import GravityTilt
-from sysid_btr.terms.integral_gain import IntegralGain
-from sysid_btr.terms.joint_compliance import JointCompliance
-from sysid_btr.terms.joint_spring import JointSpring
-from sysid_btr.terms.load_friction import LoadFriction
+from sysid_btr.terms.inertial import GravityTilt, Payload
+from sysid_btr.terms.limits import TorqueLimit
 from sysid_btr.terms.model import Model
-from sysid_btr.terms.payload import Payload
-from sysid_btr.terms.torque_limit import TorqueLimit
+from sysid_btr.terms.sensing import EncoderOffset, EncoderOffsetInLoop
+from sysid_btr.terms.servo import CommandDelay, IntegralGain
+from sysid_btr.terms.spring import JointSpring
+from sysid_btr.terms.transmission import Backlash, JointCompliance
 from sysid_btr.writeback.params import read_params, starts_from
 from sysid_btr.writeback.write import Draft, Identified, describe_model, draft, identified, params_of, save_model
 from sysid_btr.writeback.xmltext import Edit, append_child, apply, comment, number, parse, set_attributes

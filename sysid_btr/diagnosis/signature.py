@@ -19,14 +19,14 @@ from sysid_btr.diagnosis.signal_features import Line, Train, hats, predicted_sha
 from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.terms.cogging import Cogging
-from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.external_disturbance import (
+from sysid_btr.terms.disturbance import (
     DriveDisturbanceTrain,
     ExternalDisturbance,
     ExternalDisturbanceTrain,
 )
+from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.transmission import Cogging
 
 LOUD = 1.3
 """Chi2 of a joint's position from which its error is looked at."""

@@ -18,8 +18,8 @@ from sysid_btr.objectives.problem import Episode, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target
 from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Outputs, Term
+from sysid_btr.terms.disturbance import ExternalDisturbanceTrain
 from sysid_btr.terms.effect import scale_at
-from sysid_btr.terms.external_disturbance import ExternalDisturbanceTrain
 from sysid_btr.terms.scales import Scales
 
 MOST_SAMPLES = 8192

@@ -6,44 +6,31 @@ import difflib
 from collections.abc import Sequence
 
 from sysid_btr.errors import UsageError
-from sysid_btr.terms.armature import Armature
-from sysid_btr.terms.back_emf import BackEmf
-from sysid_btr.terms.backlash import Backlash, BacklashMotor
-from sysid_btr.terms.cogging import Cogging
-from sysid_btr.terms.com_offset import ComOffset
-from sysid_btr.terms.command_delay import CommandDelay
-from sysid_btr.terms.constant_force import ConstantForce
-from sysid_btr.terms.coulomb_friction import CoulombFriction
-from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.encoder_offset import EncoderOffset, EncoderOffsetInLoop
-from sysid_btr.terms.encoder_scale import EncoderScale, EncoderScaleInLoop
-from sysid_btr.terms.external_disturbance import (
+from sysid_btr.terms.contact import FootCompliance, FootFriction
+from sysid_btr.terms.disturbance import (
+    ConstantForce,
     DriveDisturbanceTrain,
     ExternalDisturbance,
     ExternalDisturbanceTrain,
 )
-from sysid_btr.terms.foot_compliance import FootCompliance
-from sysid_btr.terms.foot_friction import FootFriction
-from sysid_btr.terms.gravity_tilt import GravityTilt
-from sysid_btr.terms.integral_gain import IntegralGain
-from sysid_btr.terms.joint_compliance import JointCompliance, JointComplianceMotor
-from sysid_btr.terms.joint_spring import JointSpring
-from sysid_btr.terms.load_friction import (
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.friction import (
+    CoulombFriction,
     LoadFriction,
     LoadFrictionLarger,
     LoadFrictionQuadratic,
     LoadFrictionStribeck,
+    QuadraticDamping,
+    StribeckFriction,
+    ViscousDamping,
 )
-from sysid_btr.terms.payload import Payload
-from sysid_btr.terms.quadratic_damping import QuadraticDamping
-from sysid_btr.terms.sensor_delay import SensorDelay
-from sysid_btr.terms.slew_limit import SlewLimit
-from sysid_btr.terms.speed_torque_limit import SpeedTorqueLimit
-from sysid_btr.terms.stribeck_friction import StribeckFriction
-from sysid_btr.terms.thermal_derating import ThermalDerating
-from sysid_btr.terms.torque_limit import TorqueLimit
-from sysid_btr.terms.viscous_damping import ViscousDamping
-from sysid_btr.terms.voltage_sag import VoltageSag, VoltageSagLoad
+from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
+from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
+from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
+from sysid_btr.terms.sensing import EncoderOffset, EncoderOffsetInLoop, EncoderScale, EncoderScaleInLoop, SensorDelay
+from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain
+from sysid_btr.terms.spring import JointSpring
+from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
 EFFECTS: tuple[type[Effect], ...] = (
     CoulombFriction,

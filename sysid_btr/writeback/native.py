@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.terms.base import BatchModel, Fields, Term
-from sysid_btr.terms.command_delay import CommandDelay
-from sysid_btr.terms.constant_force import ConstantForce
-from sysid_btr.terms.encoder_offset import EncoderOffsetInLoop
+from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.fields import ConstantForce as ConstantForceField
 from sysid_btr.terms.fields import Delay
-from sysid_btr.terms.payload import Payload
+from sysid_btr.terms.inertial import Payload
+from sysid_btr.terms.sensing import EncoderOffsetInLoop
+from sysid_btr.terms.servo import CommandDelay
 
 if TYPE_CHECKING:
     import mujoco

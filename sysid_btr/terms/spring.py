@@ -1,4 +1,4 @@
-"""A spring across a joint: a cable, a rubber stop, gravity compensation."""
+"""Springs across a joint."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from sysid_btr.terms.scales import JointScale
 
 @dataclass(frozen=True)
 class JointSpring(Effect):
-    """Native: `jnt_stiffness` and `qpos_spring`; stiffness zero is the plain model at any rest angle."""
+    """A spring across a joint: a cable, a rubber stop, gravity compensation.
+
+    Native: `jnt_stiffness` and `qpos_spring`; stiffness zero is the plain model at any rest angle.
+    """
 
     name: ClassVar[str] = "joint_spring"
     title: ClassVar[str] = "spring across the joint"

@@ -1,4 +1,4 @@
-"""A load that a body carries: a mass at a place in the body's frame, with an inertia of its own."""
+"""Masses, centres of mass, inertias, and the direction of gravity."""
 
 from __future__ import annotations
 
@@ -17,6 +17,32 @@ if TYPE_CHECKING:
     import mujoco
 
 
+@dataclass(frozen=True)
+class Armature(Effect):
+    """Rotor inertia seen at the joint through the gear: ratio squared times the rotor's.
+
+    Native: `dof_armature`.
+    """
+
+    name: ClassVar[str] = "armature"
+    title: ClassVar[str] = "rotor inertia"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("inertia", "kg m2", 0.0, 0.0, 1.0, 0.001),)
+    everywhere: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("payload", "poses in which gravity pulls at the joint"),
+        ("command_delay", "motion at several frequencies"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return (Kind("inertia", scale.unit("kg m2"), 0.0, 0.0, 5 * scale.inertia, 0.05 * scale.inertia),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        armature = batch.read("dof_armature")
+        armature[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
+        return {"dof_armature": armature}
+
+
 ARM = 0.05
 """Distance, m, of a load whose mass a scan cannot tell from its place."""
 
@@ -26,7 +52,9 @@ LEVERS = (0.03, 0.2)
 
 @dataclass(frozen=True)
 class Payload(Effect):
-    """Native: the body's mass, centre of mass and inertia are those of body and load together.
+    """A load that a body carries: a mass at a place in the body's frame, with an inertia of its own.
+
+    Native: the body's mass, centre of mass and inertia are those of body and load together.
 
     The parameters are the mass and the position of the load in the frame of the body, whose origin is
     the joint it hangs on where the model follows the usual convention, and the inertia about its own centre, alike
@@ -118,3 +146,67 @@ def _quaternions(matrices: FloatArray) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(matrices).as_quat(scalar_first=True))
+
+
+@dataclass(frozen=True)
+class ComOffset(Effect):
+    """A body whose centre of mass is not where the model has it.
+
+    Native: `body_ipos`.
+    """
+
+    name: ClassVar[str] = "com_offset"
+    title: ClassVar[str] = "shift of the centre of mass"
+    scope: ClassVar = "body"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = tuple(Kind(axis, "m", 0.0, -0.06, 0.06, 0.005) for axis in "xyz")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("payload", "a body on a free base, or fast motion"),
+        ("encoder_offset", "several poses"),
+    )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        d = 0.01
+        return (((d, 0.0, 0.0), (0.0, d, 0.0), (0.0, 0.0, d)),)
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        allow_any_inertia(spec, self.places)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = [batch.model.body(name).id for name in self.places]
+        centre = batch.read("body_ipos")
+        centre[:, ids] += values
+        return {"body_ipos": centre}
+
+
+@dataclass(frozen=True)
+class GravityTilt(Effect):
+    """A mount that is not level: gravity is tilted for the whole robot.
+
+    Native: `opt.gravity`, turned by the angle `x` about the world's x axis, then `y` about its y axis.
+    """
+
+    name: ClassVar[str] = "gravity_tilt"
+    title: ClassVar[str] = "tilt of the mount"
+    scope: ClassVar = "robot"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("x", "rad", 0.0, -0.3, 0.3, 0.01),
+        Kind("y", "rad", 0.0, -0.3, 0.3, 0.01),
+    )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("com_offset", "an IMU, or several limbs"),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return (((0.02, 0.0), (0.0, 0.02)),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        gravity = batch.read("opt.gravity")
+        x, y = values[:, 0, 0], values[:, 0, 1]
+        gx, gy, gz = gravity[:, 0].copy(), gravity[:, 1].copy(), gravity[:, 2].copy()
+        gy, gz = np.cos(x) * gy - np.sin(x) * gz, np.sin(x) * gy + np.cos(x) * gz
+        gravity[:, 0] = np.cos(y) * gx + np.sin(y) * gz
+        gravity[:, 1] = gy
+        gravity[:, 2] = -np.sin(y) * gx + np.cos(y) * gz
+        return {"opt.gravity": gravity}

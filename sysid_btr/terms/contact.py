@@ -1,4 +1,4 @@
-"""Softness of the contact between feet and ground."""
+"""Contact between feet and ground."""
 
 from __future__ import annotations
 
@@ -14,8 +14,37 @@ from sysid_btr.terms.scales import JointScale
 
 
 @dataclass(frozen=True)
+class FootFriction(Effect):
+    """Sliding friction between feet and ground.
+
+    Native: `geom_friction` as a factor of the nominal, on the ground and on what stands on it.
+    """
+
+    name: ClassVar[str] = "foot_friction"
+    title: ClassVar[str] = "change of the ground's friction"
+    scope: ClassVar = "robot"
+    needs: ClassVar[str] = "a free base on the ground"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("factor", "1", 1.0, 0.1, 3.0, 0.1),)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("gravity_tilt", "motion in several directions"),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return (((0.8,),), ((0.5,),))
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        touching = (batch.model.geom_contype != 0) | (batch.model.geom_conaffinity != 0)
+        friction = batch.read("geom_friction")
+        friction[:, np.flatnonzero(touching), 0] *= values[:, 0, :1]
+        return {"geom_friction": friction}
+
+
+@dataclass(frozen=True)
 class FootCompliance(Effect):
-    """Native: the time constant of `geom_solref` as a factor of the nominal."""
+    """Softness of the contact between feet and ground.
+
+    Native: the time constant of `geom_solref` as a factor of the nominal.
+    """
 
     name: ClassVar[str] = "foot_compliance"
     title: ClassVar[str] = "change of the ground's softness"

@@ -1,0 +1,262 @@
+"""Friction and damping at a joint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Step
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.scales import JointScale
+
+
+@dataclass(frozen=True)
+class CoulombFriction(Effect):
+    """Dry friction: a torque of constant size against the motion; it holds the joint still up to that size.
+
+    Native: `dof_frictionloss`.
+    """
+
+    name: ClassVar[str] = "coulomb_friction"
+    title: ClassVar[str] = "dry friction"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.05),)
+    everywhere: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("stribeck_friction", "slow motion below the Stribeck velocity"),
+        ("load_friction", "the same motion under different loads"),
+        ("backlash", "reversals under a load that does not change sign"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        unit, size = scale.unit("Nm"), 0.15 * scale.torque_rms
+        return (Kind("torque", unit, 0.0, 0.0, scale.counter_peak, size),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        size = cls.sized(scale)[0].scale
+        held = 0.7 * scale.measured_rms  # a joint that sticks most of the time
+        return tuple(((t,),) for t in (size, 4 * size, *((held,) if held > 6 * size else ())))
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        friction = batch.read("dof_frictionloss")
+        friction[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
+        return {"dof_frictionloss": friction}
+
+
+@dataclass(frozen=True)
+class ViscousDamping(Effect):
+    """Viscous damping: a torque proportional to velocity, against it.
+
+    Native: `dof_damping`. The same as the servo's kv where only position is logged.
+    """
+
+    name: ClassVar[str] = "viscous_damping"
+    title: ClassVar[str] = "viscous damping"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", 0.0, 0.0, 10.0, 0.05),)
+    everywhere: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("kv", "a logged effort or current; position alone cannot tell the two apart"),
+        ("quadratic_damping", "motion at several speeds"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return (Kind("b", scale.unit("Nm s/rad"), 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        damping = batch.read("dof_damping")
+        damping[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
+        return {"dof_damping": damping}
+
+
+@dataclass(frozen=True)
+class QuadraticDamping(Effect):
+    """Quadratic damping: a torque proportional to velocity times speed, against it.
+
+    Native: the first term of `dof_dampingpoly`.
+    """
+
+    name: ClassVar[str] = "quadratic_damping"
+    title: ClassVar[str] = "quadratic damping"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s2/rad2", 0.0, 0.0, 10.0, 0.05),)
+    everywhere: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("viscous_damping", "motion at several speeds"),
+        ("speed_torque_limit", "fast motion under low load"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        size = scale.damping / scale.velocity_rms
+        return (Kind("b", scale.unit("Nm s2/rad2"), 0.0, 0.0, 5 * size, 0.1 * size),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        damping = batch.read("dof_dampingpoly")
+        damping[:, batch.index.dof[batch.index.of(self.places)], 0] += values[:, :, 0]
+        return {"dof_dampingpoly": damping}
+
+
+SIZES, SHARES, SPEEDS = (0.6, 1.0, 1.6), (0.2, 0.5, 0.8), (0.4, 1.0, 2.5)
+"""Multiples of what a linear scan says from which a refit may begin."""
+
+
+@dataclass(frozen=True)
+class StribeckFriction(Effect):
+    """Stribeck friction: dry friction that is larger at rest than in motion.
+
+    F(v) = F_c + F_s exp(-(v / v_s)^2) (Armstrong-Helouvry, Dupont, Canudas de Wit 1994,
+    doi:10.1016/0005-1098(94)90209-7).
+
+    Law: friction follows the velocity at the middle of each step.
+    """
+
+    name: ClassVar[str] = "stribeck_friction"
+    title: ClassVar[str] = "friction that falls with speed"
+    law_acts: ClassVar[tuple[str, ...]] = ("friction",)
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("coulomb", "Nm", 0.0, 0.0, 10.0, 0.05),
+        Kind("static", "Nm", 0.0, 0.0, 10.0, 0.05),
+        Kind("velocity", "rad/s", 0.1, 0.01, 3.0, 0.05),
+    )
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
+    main: ClassVar[int] = 1
+    held: ClassVar[tuple[str, ...]] = ("velocity",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("coulomb_friction", "slow motion below the Stribeck velocity"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        peak, size = scale.counter_peak, 0.15 * scale.torque_rms
+        speed = 0.2 * scale.velocity_rms
+        return (
+            Kind("coulomb", scale.unit("Nm"), 0.0, 0.0, peak, size),
+            Kind("static", scale.unit("Nm"), 0.0, 0.0, peak, size),
+            Kind("velocity", scale.unit("rad/s"), speed, 0.02 * speed, 20 * speed, 0.5 * speed),
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        size, _, speed = cls.sized(scale)
+        held = 0.5 * scale.measured_rms  # a joint that sticks most of the time
+        amounts = (2 * size.scale, *((held,) if held > 6 * size.scale else ()))
+        return tuple(
+            ((a, 0.0, factor * speed.nominal), (0.0, a, factor * speed.nominal))
+            for a in amounts
+            for factor in (0.3, 1.0, 3.0)
+        )
+
+    @classmethod
+    def ladder(cls, values: FloatArray) -> FloatArray:
+        """Sum of both, share of the part that falls, and velocity: stick-slip has many local minima."""
+        total = float(values[0] + values[1])
+        return np.array(
+            [
+                (total * size * (1 - share), total * size * share, values[2] * speed)
+                for size in SIZES
+                for share in SHARES
+                for speed in SPEEDS
+            ]
+        )
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        speed = step.qvel[:, index] / values[:, :, 2]
+        step.friction[:, index] += values[:, :, 0] + values[:, :, 1] * np.exp(-np.square(speed))
+
+
+@dataclass(frozen=True)
+class LoadFriction(Effect):
+    """Load-dependent friction: teeth and bearings rub the more, the more they carry (BAM, arXiv:2410.08650).
+
+    A gear is loaded from two sides: by its motor, and by the weight and motion of the links.
+
+    Law: friction follows the servo's torque at the middle of each step.
+    """
+
+    name: ClassVar[str] = "load_friction"
+    title: ClassVar[str] = "friction per unit of load"
+    scope: ClassVar = "servo"
+    law_acts: ClassVar[tuple[str, ...]] = ("friction",)
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("ratio", "1", 0.0, 0.0, 0.9, 0.08),)
+    steps: ClassVar[tuple[float, ...]] = (1.0, 4.0)
+    everywhere: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("coulomb_friction", "the same motion under different loads"),
+    )
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        step.friction[:, index] += values[:, :, 0] * np.abs(step.drive[:, index])
+
+
+@dataclass(frozen=True)
+class LoadFrictionLarger(LoadFriction):
+    """Law: friction follows the larger of two torques, the servo's and that of the links' weight and motion.
+
+    Which is what enters the gear: the motor's when it drives, the link's when it is driven back.
+    """
+
+    title: ClassVar[str] = "friction per unit of the torque that enters the gear"
+    variant: ClassVar[str] = "larger"
+    label: ClassVar[str] = "load_friction.larger"
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        entering = np.maximum(np.abs(step.drive[:, index]), np.abs(step.load[:, index]))
+        step.friction[:, index] += values[:, :, 0] * entering
+
+
+@dataclass(frozen=True)
+class LoadFrictionQuadratic(LoadFriction):
+    """Law: friction follows the square of the servo's torque: a gear is less efficient, the harder it is driven."""
+
+    title: ClassVar[str] = "friction per unit of squared load"
+    variant: ClassVar[str] = "quadratic"
+    label: ClassVar[str] = "load_friction.quadratic"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("curvature", "1/Nm", 0.0, 0.0, 1.0, 0.1),)
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        size = 1 / scale.counter_peak
+        return (Kind("curvature", f"1/{scale.unit('Nm')}", 0.0, 0.0, 2 * size, 0.1 * size),)
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        step.friction[:, index] += values[:, :, 0] * np.square(step.drive[:, index])
+
+
+@dataclass(frozen=True)
+class LoadFrictionStribeck(LoadFriction):
+    """Law: friction follows the servo's torque, more so at rest: |torque| (ratio + static exp(-(v / v_s)^2))."""
+
+    title: ClassVar[str] = "friction per unit of load that falls with speed"
+    variant: ClassVar[str] = "stribeck"
+    label: ClassVar[str] = "load_friction.stribeck"
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("ratio", "1", 0.0, 0.0, 0.9, 0.08),
+        Kind("static", "1", 0.0, 0.0, 0.9, 0.08),
+        Kind("velocity", "rad/s", 0.1, 0.01, 3.0, 0.05),
+    )
+    main: ClassVar[int] = 1
+    held: ClassVar[tuple[str, ...]] = ("velocity",)
+    everywhere: ClassVar[bool] = False
+    includes: ClassVar[tuple[str, ...]] = ("load_friction",)
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        speed = 0.2 * scale.velocity_rms
+        return (
+            cls.kinds[0],
+            cls.kinds[1],
+            Kind("velocity", scale.unit("rad/s"), speed, 0.02 * speed, 20 * speed, 0.5 * speed),
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        speed = cls.sized(scale)[2].nominal
+        return tuple(((0.1, 0.0, f * speed), (0.0, 0.1, f * speed)) for f in (0.3, 1.0, 3.0))
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        falling = np.exp(-np.square(step.qvel[:, index] / values[:, :, 2]))
+        step.friction[:, index] += np.abs(step.drive[:, index]) * (values[:, :, 0] + values[:, :, 1] * falling)

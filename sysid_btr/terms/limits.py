@@ -1,0 +1,133 @@
+"""Limits of a drive: torque, torque over speed, rate of the command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Step
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.fields import narrow_force_limit
+from sysid_btr.terms.scales import JointScale
+
+
+@dataclass(frozen=True)
+class TorqueLimit(Effect):
+    """A servo that cannot give more than a certain torque.
+
+    Native: `actuator_forcerange`. Neutral at the upper bound.
+    """
+
+    name: ClassVar[str] = "torque_limit"
+    title: ClassVar[str] = "limit of the torque"
+    scope: ClassVar = "servo"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("limit", "Nm", 100.0, 0.01, 100.0, 0.1),)
+    held: ClassVar[tuple[str, ...]] = ("limit",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("speed_torque_limit", "the limit reached at several speeds"),
+        ("slew_limit", "slow motion under a large load"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        peak = max(scale.torque_peak, 1e-9)
+        return (Kind("limit", scale.unit("Nm"), 2 * peak, 0.03 * peak, 2 * peak, 0.05 * peak),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return tuple(((f * max(scale.torque_peak, 1e-9),),) for f in (0.85, 0.65, 0.45, 0.28))
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        most = np.array([p.upper for p in self.spread_parameters(0)])
+        return narrow_force_limit(batch, self.places, np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0]))
+
+
+@dataclass(frozen=True)
+class SpeedTorqueLimit(Effect):
+    """A motor whose largest torque falls with speed: stall torque at rest, none at the no-load speed.
+
+    Law: -stall (1 + v / w0) <= torque <= stall (1 - v / w0), never beyond +-stall; none at its bound.
+    """
+
+    name: ClassVar[str] = "speed_torque_limit"
+    title: ClassVar[str] = "torque limit that falls with speed"
+    scope: ClassVar = "servo"
+    law_acts: ClassVar[tuple[str, ...]] = ("limit",)
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("stall", "Nm", 100.0, 0.01, 100.0, 0.1),
+        Kind("no_load_speed", "rad/s", 100.0, 0.1, 100.0, 0.5),
+    )
+    includes: ClassVar[tuple[str, ...]] = ("torque_limit",)
+    held: ClassVar[tuple[str, ...]] = ("stall", "no_load_speed")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("torque_limit", "the limit reached at several speeds"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        peak, speed = max(scale.torque_peak, 1e-9), max(scale.velocity_peak, 1e-9)
+        return (
+            Kind("stall", scale.unit("Nm"), 2 * peak, 0.03 * peak, 2 * peak, 0.05 * peak),
+            Kind("no_load_speed", scale.unit("rad/s"), 2 * speed, 0.2 * speed, 20 * speed, 0.2 * speed),
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        peak, speed = max(scale.torque_peak, 1e-9), max(scale.velocity_peak, 1e-9)
+        return tuple(((a * peak, b * speed),) for a in (1.2, 0.8, 0.5) for b in (1.2, 2.5))
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        most = np.array([p.upper for p in self.spread_parameters(0)])
+        stall = np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0])
+        speed = values[:, :, 1]
+        fraction = step.qvel[:, index] / speed
+        high = stall * np.maximum(1 - np.maximum(fraction, 0), 1e-9)
+        low = -stall * np.maximum(1 + np.minimum(fraction, 0), 1e-9)
+        step.limit_high[:, index] = np.minimum(step.limit_high[:, index], high)
+        step.limit_low[:, index] = np.maximum(step.limit_low[:, index], low)
+
+
+@dataclass(frozen=True)
+class SlewLimit(Effect):
+    """A servo that follows its command no faster than a certain rate.
+
+    The command is rate-limited before the replay; neutral above every rate of the log.
+    """
+
+    name: ClassVar[str] = "slew_limit"
+    title: ClassVar[str] = "limit of the commanded rate"
+    scope: ClassVar = "servo"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("rate", "rad/s", 1000.0, 0.05, 1000.0, 0.2),)
+    held: ClassVar[tuple[str, ...]] = ("rate",)
+    everywhere: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("torque_limit", "slow motion under a large load"),
+        ("speed_torque_limit", "slow motion under a large load"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        speed = max(scale.velocity_peak, 1e-9)
+        return (Kind("rate", scale.unit("rad/s"), 3 * speed, 0.05 * speed, 3 * speed, 0.05 * speed),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return tuple(((f * max(scale.velocity_peak, 1e-9),),) for f in (0.9, 0.7, 0.5, 0.3))
+
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+        shaped = np.array(command)
+        columns = batch.index.of(self.places)
+        wanted = shaped[:, :, columns]
+        # at the upper bound there is no limit: a held command jumps faster than the motion it describes
+        off = values[:, :, 0] >= np.array([p.upper for p in self.spread_parameters(0)])
+        most = np.where(off, np.inf, values[:, :, 0] * batch.timestep)
+        if off.all():
+            return shaped
+        now = wanted[:, 0].copy()
+        for k in range(wanted.shape[1]):
+            now += np.clip(wanted[:, k] - now, -most, most)
+            shaped[:, k, columns] = now
+        return shaped

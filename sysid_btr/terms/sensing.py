@@ -1,0 +1,137 @@
+"""What the sensors of a joint show: offset, scale and delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.interpolation import hermite
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Outputs
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.scales import JointScale
+
+
+@dataclass(frozen=True)
+class EncoderOffset(Effect):
+    """An encoder whose zero is off, either the logged one alone or the one that closes the servo loop too.
+
+    The log shows q + b; the servo uses the true q.
+    """
+
+    name: ClassVar[str] = "encoder_offset"
+    title: ClassVar[str] = "offset of the encoder"
+    variant: ClassVar[str] = "log"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("offset", "rad", 0.0, -0.3, 0.3, 0.005),)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("constant_force", "motion whose stiffness to torque changes, or a logged effort"),
+        ("com_offset", "several poses"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        reach = 0.3 if not scale.slide else 0.3 * scale.span
+        return (Kind("offset", scale.unit("rad"), 0.0, -reach, reach, reach / 60),)
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        outputs.position[:, :, batch.index.of(self.places)] += values[:, None, :, 0]
+
+
+@dataclass(frozen=True)
+class EncoderOffsetInLoop(EncoderOffset):
+    """The log shows q + b, and the servo closes its loop on it: seen through gravity only."""
+
+    variant: ClassVar[str] = "loop"
+
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+        shaped = command.copy()
+        shaped[:, :, batch.index.of(self.places)] -= values[:, None, :, 0]
+        return shaped
+
+    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        qpos[:, batch.index.of(self.places)] -= values[:, :, 0]
+
+
+@dataclass(frozen=True)
+class EncoderScale(Effect):
+    """An encoder whose scale is off, either the logged one alone or the one that closes the servo loop too.
+
+    The log shows (1 + e) q; the servo uses the true q.
+    """
+
+    name: ClassVar[str] = "encoder_scale"
+    title: ClassVar[str] = "error of the encoder's scale"
+    variant: ClassVar[str] = "log"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("error", "1", 0.0, -0.3, 0.3, 0.01),)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("kp", "fast motion, where the servo lags"),
+        ("joint_spring", "a logged effort"),
+    )
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        columns = batch.index.of(self.places)
+        outputs.position[:, :, columns] *= 1 + values[:, None, :, 0]
+        outputs.velocity[:, :, columns] *= 1 + values[:, None, :, 0]
+
+
+@dataclass(frozen=True)
+class EncoderScaleInLoop(EncoderScale):
+    """The log shows (1 + e) q, and the servo closes its loop on it."""
+
+    variant: ClassVar[str] = "loop"
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = batch.index.actuator[batch.index.of(self.places)]
+        bias = batch.read("actuator_biasprm")
+        bias[:, ids, 1:3] *= 1 + values[:, :, :1]
+        return {"actuator_biasprm": bias}
+
+    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
+        columns = batch.index.of(self.places)
+        qpos[:, columns] /= 1 + values[:, :, 0]
+        qvel[:, columns] /= 1 + values[:, :, 0]
+
+
+@dataclass(frozen=True)
+class SensorDelay(Effect):
+    """Delay between a joint's position and the log of it.
+
+    Predicted positions and velocities are read earlier, by cubic interpolation.
+    """
+
+    name: ClassVar[str] = "sensor_delay"
+    title: ClassVar[str] = "delay of the sensor"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.15, 0.004),)
+    needs: ClassVar[str] = "position, and a sensor or a coupled joint that is not delayed"
+    yields_to: ClassVar[tuple[str, ...]] = ("command_delay",)
+    everywhere: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("command_delay", "a second sensor that is not delayed (current, effort, IMU)"),
+    )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return (((0.008,),), ((0.025,),))
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        time = outputs.time
+        for place, column in enumerate(batch.index.of(self.places)):
+            delay = values[:, place, 0]
+            if not delay.any():
+                continue
+            early = np.maximum(time[None, :] - delay[:, None], time[0])
+            after = np.clip(np.searchsorted(time, early, side="left"), 1, len(time) - 1)
+            span = time[after] - time[after - 1]
+            f = (early - time[after - 1]) / span
+            p, v = outputs.position[:, :, column], outputs.velocity[:, :, column]
+
+            def take(array: FloatArray, at: IntArray) -> FloatArray:
+                return np.take_along_axis(array, at, axis=1)
+
+            v0, v1 = take(v, after - 1), take(v, after)
+            outputs.position[:, :, column] = hermite(f, span, take(p, after - 1), take(p, after), v0, v1)
+            outputs.velocity[:, :, column] = v0 + f * (v1 - v0)
