@@ -334,8 +334,12 @@ LEAST = replace(TINY, models=model_fit(), distance="likelihood", memory=4)
 
 def test_a_likelihood_finds_the_model_in_the_trials_first_seconds() -> None:
     outcome = tiny(hidden(), settings=LEAST)
-    assert np.abs(outcome.model / TRUTH - 1).max() < 0.02
-    assert outcome.iterations[1].transfer < 0.2 * outcome.iterations[0].transfer
+    assert np.abs(outcome.model / TRUTH - 1).max() < 0.01
+    # the second round's trials are predicted by what the first round's corrected, better than by the model as it was
+    tried = outcome.iterations[1].tried
+    plain = outcome.stage.fitness(np.array([t.controller.values for t in tried]), np.ones((1, 2)))[0]
+    error = np.abs(plain - [t.trial.fitness for t in tried]).mean()
+    assert outcome.iterations[1].transfer < 0.5 * error
     with pytest.raises(UsageError, match="likelihood"):
         replace(LEAST, distance="phi1")
 
