@@ -11,12 +11,16 @@ FIND_PYTHON = for p in $(PYTHON) python3 python3.13 python3.12 python3.11 python
 PYTEST_FLAGS ?= -n 2 --dist loadfile -q
 SOURCES := sysid_btr reference_simulator tests benchmarks sample_logs notebooks docs
 
-.PHONY: demo test lint types check notebooks docs dev format clean
+.PHONY: demo test quick lint types check notebooks docs dev format clean
 
 demo: $(VENV)/installed
 	$(BIN)/sysid-btr demo
 
 test: dev lint types check notebooks
+
+# what takes less than two minutes on two cores
+quick: lint types
+	$(BIN)/python -m pytest $(PYTEST_FLAGS) -m "not slow"
 
 dev: $(VENV)/installed-dev
 

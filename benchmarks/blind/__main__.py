@@ -226,7 +226,7 @@ def code_state() -> str:
 
 def recipe_state() -> str:
     """Digest of what makes the logs."""
-    sources = [HERE / "draw.py", HERE / "sizes.py", *sorted((ROOT / "benchmarks" / "recorder").glob("*.py"))]
+    sources = [HERE / "draw.py", HERE / "sizes.py", *sorted((ROOT / "reference_simulator").glob("*.py"))]
     return _digest([*sources, ROOT / "sample_logs" / "nao.xml", ROOT / "sample_logs" / "leg.xml"])
 
 

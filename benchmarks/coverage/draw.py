@@ -125,7 +125,7 @@ def draw(bench: Bench, number: int) -> Case:
 def recipe_state() -> str:
     """Digest of what makes the logs."""
     whole = hashlib.sha256()
-    recorder = sorted((HERE.parent / "recorder").glob("*.py"))
+    recorder = sorted((HERE.parents[1] / "reference_simulator").glob("*.py"))
     for file in (HERE / "draw.py", *recorder, *(bench.model for bench in BENCHES.values())):
         whole.update(file.read_bytes())
     return whole.hexdigest()[:8]
