@@ -17,7 +17,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.identify.fit import Fit, fewest_to_hold, fit
+from sysid_btr.identify.fit import Fit, fit
+from sysid_btr.identify.fixing import fewest_to_fix
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
@@ -194,7 +195,7 @@ def test_of_what_is_told_only_together_as_few_as_need_be_are_held() -> None:
     parameters = [Parameter(f"mass:{n}", "1", 1.0, 0.3, 3.0, 0.1) for n in "abcd"]
     found = estimates(parameters, np.ones(4), jacobian, rng.standard_normal(400), np.arange(400) // 10)
     assert [e.identifiable for e in found] == ["no", "no", "no", "yes"]
-    held = fewest_to_hold(jacobian, found)
+    held = fewest_to_fix(jacobian, found)
     assert held[:2].sum() == 1  # the other one is then told
     assert held[2]
     assert not held[3]

@@ -24,7 +24,8 @@ from sysid_btr.diagnosis.split import later_split
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal, Record
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.fit import SHIFT_TOLERATED, fit, hold_unidentifiable, numerics_shift
+from sysid_btr.identify.fit import fit
+from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.fusion import weigh_walks
 from sysid_btr.identify.intervals import Estimate, estimates
 from sysid_btr.identify.refit import (
@@ -39,6 +40,7 @@ from sysid_btr.identify.refit import (
     shorten,
 )
 from sysid_btr.identify.scores import score
+from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import body_names, joint_names, servo_joints
 from sysid_btr.terms.base import Term
@@ -675,7 +677,7 @@ def _estimates(study: Study, state: _State) -> tuple[tuple[Estimate, ...], Study
             break
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, model, iterations=4))
-    values, found, _ = hold_unidentifiable(problem, model.values, found, jacobian, known)
+    values, found, _ = fix_unidentifiable(problem, model.values, found, jacobian, known)
     last = judge(study, model.at(values))
     return found, study, replace(state, fitted=last) if known is None else state, last
 

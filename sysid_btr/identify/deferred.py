@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.estimators.base import Budget, FitResult, Progress, Termination
+from sysid_btr.estimators.base import Budget, FitResult, Progress, ResidualEstimator, Termination
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.lsq import linearise
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.numerics import Numerics
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 ROUNDS = 4
 """Times the difference is taken at most."""
+LEAST_GAIN = 0.5
+"""Decrease of the sum of squared residuals, in their mean square, for which a hypothesis, or a walk, is not simulated
+again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +84,9 @@ def corrected(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> Co
 def deferred_fit(
     problem: ReplayProblem,
     cheap: Numerics,
-    estimator: LeastSquares,
+    estimator: ResidualEstimator,
     *,
+    step: float | None = None,
     rng: Generator,
     budget: Budget,
     journal: Journal,
@@ -95,15 +99,16 @@ def deferred_fit(
     problem : under the right integrator.
     cheap : integrator and step of the derivatives.
     estimator : what minimises.
+    step : finite-difference step, fraction of the range, of the Jacobian that the result shall have; None: none.
     rng, budget, journal, progress : see `sysid_btr.estimators`.
 
     Returns
     -------
     FitResult
-        If the estimator confirms, with the right residuals at `x` and the cheap integrator's Jacobian. Converged once
-        another round lowers the right loss by less than the estimator's `least_gain`.
+        If a `step` is given, with the right residuals at `x` and the cheap integrator's Jacobian. Converged once
+        another round lowers the right loss by less than `LEAST_GAIN`.
     """
-    bare = replace(estimator, confirm=False)
+    bare = estimator.unconfirmed()
     near = corrected(problem, cheap, problem.start)
     loss, evaluations = float(np.sum(near.right**2)), 2
     for _ in range(ROUNDS):
@@ -120,11 +125,11 @@ def deferred_fit(
         gain = (loss - now) / (now / len(there.offset))
         if gain >= 0:
             near, loss = there, now
-        if not gain >= estimator.least_gain:
+        if not gain >= LEAST_GAIN:
             break
     result = replace(result, x=near.start, loss=loss, evaluations=evaluations)
-    if not estimator.confirm:
+    if step is None:
         return result
-    residual, jacobian = linearise(near, near.start, step=estimator.central_step)
+    residual, jacobian = linearise(near, near.start, step=step)
     evaluations += 2 * len(near.start) + 1
     return replace(result, evaluations=evaluations, jacobian=jacobian, residual=residual)

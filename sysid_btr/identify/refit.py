@@ -12,8 +12,8 @@ from sysid_btr.estimators.evaluator import Evaluator, Stop
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.floating_base.walk import Walk
-from sysid_btr.identify.deferred import deferred_fit
-from sysid_btr.identify.study import WIDE_STEP, Study
+from sysid_btr.identify.deferred import LEAST_GAIN, deferred_fit
+from sysid_btr.identify.study import Study
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.simulation.numerics import Numerics
@@ -101,11 +101,10 @@ def refit(
         tolerance=1e-6 if polish else 2e-4,
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
-    structural = model.terms.structural
+    structural, step = model.terms.structural, study.stencil(model.terms)
     if study.free:
-        estimator = walking(estimator)
+        estimator = estimator.for_rough_objective(step, LEAST_GAIN)
     elif structural:
-        step = study.stencil(model.terms)
         estimator = replace(estimator, forward_step=step, central_step=step)
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
@@ -115,7 +114,14 @@ def refit(
     cheaper = study.free or not (polish or costly)
     if cheaper and study.numerics != study.cheap:
         result = deferred_fit(
-            problem, study.cheap, estimator, rng=rng, budget=budget, journal=journal, progress=progress
+            problem,
+            study.cheap,
+            estimator,
+            step=step if polish else None,
+            rng=rng,
+            budget=budget,
+            journal=journal,
+            progress=progress,
         )
     else:
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
@@ -140,23 +146,6 @@ def best_start(study: Study, terms: Terms, starts: FloatArray) -> FloatArray:
 
 MOST_WALKED = 8.0
 """s of windows on which hypotheses about a walk are compared."""
-
-
-LEAST_GAIN = 0.5
-"""Decrease of the sum of squared residuals, in their mean square, for which a hypothesis, or a walk, is not simulated
-again."""
-
-
-def walking(estimator: LeastSquares) -> LeastSquares:
-    """Least squares for an objective that impacts roughen: differences over what matters, a coarser end."""
-    return replace(
-        estimator,
-        tolerance=max(estimator.tolerance, 1e-4),
-        forward_step=max(estimator.forward_step, WIDE_STEP),
-        central_step=max(estimator.central_step, WIDE_STEP),
-        max_iterations=min(estimator.max_iterations, 8),
-        least_gain=LEAST_GAIN,
-    )
 
 
 def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:

@@ -1,0 +1,78 @@
+"""First fits: how a digital servo is realised, and how far each column of the log can be explained."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.floating_base.walk import Walk
+from sysid_btr.identify.numerics import held_numerics
+from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten
+from sysid_btr.identify.study import Study
+from sysid_btr.terms.model import Model
+
+MISFIT = 1.5
+"""Chi2 of a column beyond which its error, not its noise, sets its weight."""
+ROBUST_ROUNDS = 4
+SERVO_SECONDS = 6.0
+"""Part of each log on which the realisation of a digital servo is chosen ..."""
+SERVO_MARGIN = 0.05
+"""... and mean decrease of log chi2 for which the one that takes longer is."""
+STIFFER = (0.6, 0.35, 0.25)
+"""Contact time constants tried first, as factors of the nominal."""
+
+
+def weigh_columns(study: Study, model: Model) -> tuple[Study, Fitted]:
+    """The study with each column weighed by the error that a first fit from a model leaves in it, and that fit."""
+    study, coarse = settled_refit(study, model) if study.free else (study, refit(study, model))
+    if float(coarse.train_columns.max()) > MISFIT:
+        if not study.free:  # windows are weighed one by one already
+            study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
+        study = inflate(study, coarse, memory=True)
+    return study, coarse
+
+
+def realise_servo(study: Study, model: Model) -> Study:
+    """The study with the realisation of a digital servo that fits the log better.
+
+    Held torque under a known velocity, or an Euler step a period, which is a velocity from differences.
+    """
+    if study.numerics.integrator != "Euler":
+        return study
+    held = held_numerics(study.robot, study.train[0], study.threads)
+    if held is None:
+        return study
+    short = shorten(study, SERVO_SECONDS)
+    misfit = [
+        float(np.mean(np.log(refit(replace(short, numerics=n), model, iterations=4).train_columns)))
+        for n in (held, study.numerics)
+    ]
+    return replace(study, numerics=held) if misfit[0] < misfit[1] - SERVO_MARGIN else study
+
+
+def settled_refit(study: Study, model: Model) -> tuple[Study, Fitted]:
+    """First fit of walks: parameters, and starts of windows, in turn, with a cheap integrator."""
+    numerics = study.numerics
+    study = replace(study, numerics=study.rough)
+    first = best_start(study, model.terms, contact_starts(model))
+    coarse = refit(study, model.at(first), iterations=5)
+    study = study.settled(coarse.model, held=False, anew=False)
+    again = refit(study, coarse.model, iterations=3)
+    study = replace(study.settled(again.model), numerics=numerics)
+    spent = again.evaluations + coarse.evaluations
+    if all(isinstance(log, Walk) for log in study.train):
+        return study, judge(study, again.model, spent)
+    # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model
+    right = refit(study, again.model)
+    return study, replace(right, evaluations=right.evaluations + spent)
+
+
+def contact_starts(model: Model) -> FloatArray:
+    """Starts (k, p) that differ in how stiff the ground is: between a soft and a hard one the loss is not convex."""
+    own = [i for i, name in enumerate(model.terms.names) if name.startswith("foot_compliance")]
+    starts = np.tile(model.values, (1 + len(STIFFER) * bool(own), 1))
+    for row, factor in zip(starts[1:], STIFFER, strict=False):
+        row[own] *= factor
+    return starts
