@@ -27,6 +27,7 @@ from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
+from sysid_btr.diagnosis.selection import Selection
     from sysid_btr.identify.study import Study
 
 FOLDS = ("none", "kp100", "kp200", "kp400")
@@ -46,8 +47,8 @@ EFFECTS = (
     "joint_spring",
 )
 """Friction, drive and mounting: what a servo on a bench can have. `--effects all` considers the whole library."""
-WORTH = 2e-4
-"""See `close`: as many rungs as help to predict."""
+LADDER = Selection(minimum_gain=2e-4)
+"""As many rungs as help to predict."""
 SEARCH, FINAL = 0.005, 0.0025
 """Steps, s, of the search and of the final fit."""
 PUBLISHED = "0.050 rad with its simplest and 0.021 rad with its richest model: BAM, refitted to the same nine logs"
@@ -98,7 +99,7 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     study = make_study(
         xl330(), kept, channels=("position",), numerics=Numerics("RK4", SEARCH), threads=1
     )
-    found = close(study, list(DECLARED), effects=effects, progress=tell, worth=WORTH)
+    found = close(study, list(DECLARED), effects=effects, progress=tell, selection=LADDER)
     # every log in full, and all alike
     whole = make_study(
         xl330(), logs, channels=("position",), numerics=Numerics("RK4", FINAL), threads=1

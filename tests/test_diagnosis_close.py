@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import toys
 
-from sysid_btr.diagnosis import close as closing
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
 from sysid_btr.diagnosis.hypotheses import Hypothesis
-from sysid_btr.diagnosis.scan import Question, Trace, where_something_is
+from sysid_btr.diagnosis.scan import Question, Sensitivity, where_something_is
+from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.trials import attempt
 from sysid_btr.estimators import Journal
 from sysid_btr.identify.refit import judge
 from sysid_btr.identify.study import make_study
@@ -354,15 +355,16 @@ def test_costly_questions_are_asked_only_where_a_simple_effect_explains_somethin
     def question(effect: type[Effect], *places: str) -> Question:
         return Question(effect, places, ((1.0,),))
 
-    def trace(place: str, gain: float) -> Trace:
+    def sensitivity(place: str, gain: float) -> Sensitivity:
         nothing = np.zeros(0)
-        return Trace(question(CoulombFriction, place), nothing.astype(np.int64), nothing, nothing, gain, nothing)
+        return Sensitivity(question(CoulombFriction, place), nothing.astype(np.int64), nothing, nothing, gain, nothing)
 
     plain = [question(CoulombFriction, p) for p in ("hip", "knee", "ankle")]
     costly = [question(Backlash, p) for p in ("hip", "knee", "ankle", "toe")] + [question(Backlash, "ankle", "hip")]
-    asked = where_something_is(plain, [trace("knee", 500.0), trace("hip", 6.0), trace("ankle", 4.0)], costly)
+    found = [sensitivity("knee", 500.0), sensitivity("hip", 6.0), sensitivity("ankle", 4.0)]
+    asked = where_something_is(plain, found, costly, Selection())
     assert [q.places for q in asked] == [("hip",), ("knee",), ("toe",), ("ankle", "hip")], "nothing is known of the toe"
-    assert where_something_is([], [], costly) == costly
+    assert where_something_is([], [], costly, Selection()) == costly
 
 
 class Halt(BaseException):
@@ -401,6 +403,6 @@ def test_a_hypothesis_that_is_too_fast_for_the_step_is_tried_with_a_shorter_one(
     diverging = judge(coarse, plain.model.with_(soft.term(coarse.scales), soft.start))
     assert np.isfinite(plain.holdout)
     assert np.isnan(diverging.holdout)
-    found = closing._try(coarse, plain.model, soft)
+    found = attempt(coarse, plain.model, soft, Selection()).fitted
     assert np.isfinite(found.holdout)
     assert found.numerics.timestep < 0.02

@@ -31,7 +31,7 @@ EXPLAINED = 3.0
 """Position error, in noise floors, of trials, and of their beginnings, up to which nothing is looked for."""
 SAME = ("sensor_delay",)
 """Effects not asked for: commands that are played from rest do not tell a late encoder from a late command."""
-WORTH, ROUNDS = 0.05, 2
+MINIMUM_GAIN, ROUNDS = 0.05, 2
 """Fraction of some joint's error that an effect must explain to join the model, and effects that join at once."""
 LEFT = 0.75
 """Fraction of the held-out mean squared error that effects may leave, to join, and that amounts of their own at every
@@ -100,6 +100,7 @@ def _look(
     """
     from sysid_btr.btr.study import early_logs, trial_study
     from sysid_btr.diagnosis.close import close
+    from sysid_btr.diagnosis.selection import Selection
     from sysid_btr.identify.refit import judge
     from sysid_btr.terms.library import select_effects
 
@@ -124,9 +125,7 @@ def _look(
             free.terms,
             effects=effects,
             start=free.values,
-            alike=True,
-            worth=WORTH,
-            rounds=ROUNDS,
+            selection=Selection(alike=True, minimum_gain=MINIMUM_GAIN, rounds=ROUNDS),
             progress=progress,
         )
     except SysidError as error:

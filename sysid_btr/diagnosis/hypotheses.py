@@ -1,4 +1,4 @@
-"""From traces to hypotheses: one effect at one place, at several places, or the same at all of them."""
+"""From sensitivities to hypotheses: one effect at one location, at several, or the same at all of them."""
 
 from __future__ import annotations
 
@@ -8,20 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.scan import Trace
+from sysid_btr.diagnosis.scan import Sensitivity
+from sysid_btr.diagnosis.selection import Selection, agree
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.scales import Scales
-
-NEW_PLACE = 0.02
-"""A further place must explain this fraction of what its effect explains at all places so far."""
-WORTH_TRYING = 40.0
-"""Decrease of the sum of squared whitened residuals below which a place is noise (a scan asks many questions)."""
-MOST_NUMBERS = 24
-"""Parameters that one hypothesis may add."""
-EVEN = 0.35
-"""Relative spread of amounts within which places may share one."""
-RIVAL = 0.35
-"""A place joins a group only if this effect explains there at least this fraction of what the best effect does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +42,7 @@ class Hypothesis:
         kinds = len(self.effect.kinds)
         return self.size // kinds * (kinds - len(self.effect.details))
 
-    def ladder(self) -> FloatArray:
+    def initial_guesses(self) -> FloatArray:
         """Amounts (k, parameters) that a refit may begin from, those of the scan first."""
         kinds = len(self.effect.kinds)
         amounts = [self.effect.ladder(a) for a in self.start.reshape(-1, kinds)]
@@ -66,44 +56,42 @@ class Hypothesis:
         return f"{self.effect.label or self.effect.name} at {places}"
 
 
-def form_hypotheses(traces: Sequence[Trace], residuals: int, most: int) -> list[Hypothesis]:
+def form_hypotheses(found: Sequence[Sensitivity], residuals: int, rules: Selection) -> list[Hypothesis]:
     """The most promising hypotheses of a scan, best first, of different effects as far as possible.
 
     Parameters
     ----------
-    traces : of a scan.
+    found : by a scan.
     residuals : length of the residual vector.
-    most : how many to return.
+    rules : what a hypothesis needs, and how many to return.
     """
     best_at: dict[str, float] = {}
-    single = [t for t in traces if len(t.question.places) == 1]
-    for trace in single:
-        place = trace.question.place
-        best_at[place] = max(best_at.get(place, 0.0), trace.gain)
+    single = [s for s in found if len(s.question.places) == 1]
+    for one in single:
+        place = one.question.place
+        best_at[place] = max(best_at.get(place, 0.0), one.gain)
     result: list[Hypothesis] = []
-    for trace in traces:
-        if len(trace.question.places) > 1 and trace.gain >= WORTH_TRYING:
-            question = trace.question
-            result.append(Hypothesis(question.effect, question.places, True, trace.values, trace.gain))
-    for effect in dict.fromkeys(t.question.effect for t in single):
-        own = _best_probe_per_place([t for t in single if t.question.effect is effect])
-        if own[0].gain < WORTH_TRYING:
+    for one in found:
+        if len(one.question.places) > 1 and one.gain >= rules.candidate_gain:
+            question = one.question
+            result.append(Hypothesis(question.effect, question.places, True, one.values, one.gain))
+    for effect in dict.fromkeys(s.question.effect for s in single):
+        own = _best_probe_per_place([s for s in single if s.question.effect is effect])
+        if own[0].gain < rules.candidate_gain:
             continue
         lead = own[0]
         result.append(Hypothesis(effect, (lead.question.place,), False, lead.values, lead.gain))
-        candidates = [t for t in own if t.gain >= RIVAL * best_at[t.question.place]]
-        group, gain = _grow(lead, candidates, residuals)
-        group = group[: max(MOST_NUMBERS // len(effect.kinds), 1)]
+        candidates = [s for s in own if s.gain >= rules.location_rival * best_at[s.question.place]]
+        group, gain = _grow(lead, candidates, residuals, rules)
+        group = group[: max(rules.most_parameters // len(effect.kinds), 1)]
         if len(group) > 1:
-            places = tuple(t.question.place for t in group)
-            values = np.array([t.values for t in group])
+            places = tuple(s.question.place for s in group)
+            values = np.array([s.values for s in group])
             result.append(Hypothesis(effect, places, False, values.ravel(), gain))
-            main = values[:, effect.main]
-            middle = float(np.median(main))
-            if np.all(np.abs(main - middle) <= EVEN * abs(middle)):
+            if agree(values[:, effect.main], rules.common_spread):
                 result.append(Hypothesis(effect, places, True, np.median(values, axis=0), gain))
     result.sort(key=lambda h: -h.gain)
-    return _varied(_without_idle(result), most)
+    return _varied(_without_idle(result, rules), rules)
 
 
 def to_arrays(
@@ -142,41 +130,43 @@ def from_arrays(
     ]
 
 
-def _best_probe_per_place(traces: Sequence[Trace]) -> list[Trace]:
-    best: dict[str, Trace] = {}
-    for trace in traces:
-        place = trace.question.place
-        if place not in best or trace.gain > best[place].gain:
-            best[place] = trace
-    return sorted(best.values(), key=lambda t: -t.gain)
+def _best_probe_per_place(found: Sequence[Sensitivity]) -> list[Sensitivity]:
+    best: dict[str, Sensitivity] = {}
+    for one in found:
+        place = one.question.place
+        if place not in best or one.gain > best[place].gain:
+            best[place] = one
+    return sorted(best.values(), key=lambda s: -s.gain)
 
 
-def _grow(lead: Trace, candidates: Sequence[Trace], residuals: int) -> tuple[list[Trace], float]:
-    """Add places greedily while they explain something that those before do not (orthogonal matching)."""
+def _grow(
+    lead: Sensitivity, candidates: Sequence[Sensitivity], residuals: int, rules: Selection
+) -> tuple[list[Sensitivity], float]:
+    """Add locations greedily while they explain something that those before do not (orthogonal matching)."""
     group = [lead]
     basis = _unit(lead, residuals, None)
     target_gain = lead.gain
-    for trace in candidates:
-        if trace is lead:
+    for one in candidates:
+        if one is lead:
             continue
-        vector = _unit(trace, residuals, basis)
+        vector = _unit(one, residuals, basis)
         if vector is None or basis is None:
             continue
         # gain that is left after what the group explains, to first order
         kept = float(np.linalg.norm(vector[:, -1])) if vector.size else 0.0
         share = kept**2 if kept < 1 else 1.0
-        left = trace.gain * share
-        if left >= max(WORTH_TRYING, NEW_PLACE * target_gain):
-            group.append(trace)
+        left = one.gain * share
+        if left >= max(rules.candidate_gain, rules.location_gain * target_gain):
+            group.append(one)
             target_gain += left
             basis = np.column_stack([basis, vector[:, -1] / max(kept, 1e-300)])
     return group, target_gain
 
 
-def _unit(trace: Trace, residuals: int, basis: FloatArray | None) -> FloatArray | None:
-    """The trace's own explanation as a unit vector, less what a basis spans; (residuals, 1)."""
+def _unit(one: Sensitivity, residuals: int, basis: FloatArray | None) -> FloatArray | None:
+    """What it explains of the residual as a unit vector, less what a basis spans; (residuals, 1)."""
     full = np.zeros(residuals)
-    full[trace.rows] = trace.response @ trace.amounts
+    full[one.rows] = one.response @ one.amounts
     norm = float(np.linalg.norm(full))
     if norm == 0:
         return None
@@ -186,26 +176,26 @@ def _unit(trace: Trace, residuals: int, basis: FloatArray | None) -> FloatArray 
     return full[:, None]
 
 
-def _without_idle(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _without_idle(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
     """Drop an effect that includes a simpler one where all that it adds is zero."""
     named = {h.effect.name for h in ranked}
-    return [h for h in ranked if not (named & set(h.effect.includes) and _idle(h))]
+    return [h for h in ranked if not (named & set(h.effect.includes) and _idle(h, rules))]
 
 
-def _idle(h: Hypothesis) -> bool:
+def _idle(h: Hypothesis, rules: Selection) -> bool:
     main = h.start[h.effect.main :: len(h.effect.kinds)]
     size = np.abs(h.start).max()
-    return bool(np.all(np.abs(main) <= 1e-3 * size))
+    return bool(np.all(np.abs(main) <= rules.idle * size))
 
 
-def _varied(ranked: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
-    """Best first, but at most three hypotheses of one effect class, so that rivals get their turn."""
+def _varied(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
+    """Best first, but only some hypotheses of one effect class, so that rivals get their turn."""
     taken: dict[type[Effect], int] = {}
     result = []
     for hypothesis in ranked:
-        if taken.get(hypothesis.effect, 0) < 3:
+        if taken.get(hypothesis.effect, 0) < rules.refits_of_one:
             taken[hypothesis.effect] = taken.get(hypothesis.effect, 0) + 1
             result.append(hypothesis)
-        if len(result) == most:
+        if len(result) == rules.refits:
             break
     return result

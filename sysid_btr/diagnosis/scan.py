@@ -1,4 +1,4 @@
-"""Score scan: what every effect at every place would do to the residual, by simulation.
+"""Score scan: what every effect at every location would do to the residual, by simulation.
 
 Each effect is simulated at a few working points; its response, projected off what the declared parameters
 can do, is compared with the residual. Subtrees that move independently are scanned in one simulation.
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.subtrees import WHOLE_ROBOT
 from sysid_btr.terms.effect import Effect, Probe, middle_scale, scale_at
@@ -24,8 +25,6 @@ BLOCK = 256
 """Questions whose responses are held at once."""
 NO_RESPONSE = 1e-6
 """Response, relative to the residual, below which a log cannot show an effect."""
-SLIGHT = 0.01
-"""Fraction of the best place's gain below which nothing costly is asked about a place."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,8 @@ class Question:
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
-    """Answer to a question.
+class Sensitivity:
+    """What the residual does, by what was asked.
 
     Attributes
     ----------
@@ -90,7 +89,8 @@ def scan(
     jacobian: FloatArray,
     asked: Sequence[Question],
     scales: Scales,
-) -> list[Trace]:
+    rules: Selection,
+) -> list[Sensitivity]:
     """Simulate every question about the residual that a fit has left.
 
     Parameters
@@ -100,23 +100,24 @@ def scan(
     residual, jacobian : (r,) and (r, p) there, whitened.
     asked : effects, places, working points.
     scales : sizes at the joints.
+    rules : where costly questions are asked.
 
     Returns
     -------
-    list of Trace
+    list of Sensitivity
         Those that respond at all, best first.
     """
     basis = _orthonormal(jacobian)
     rest = residual - basis @ (basis.T @ residual)
     plain = [q for q in asked if not _costly(q)]
-    traces = _ask(problem, values, rest, basis, plain, scales) if plain else []
-    costly = where_something_is(plain, traces, [q for q in asked if _costly(q)])
+    found = _ask(problem, values, rest, basis, plain, scales) if plain else []
+    costly = where_something_is(plain, found, [q for q in asked if _costly(q)], rules)
     laws = [q for q in costly if not q.effect.structural]
     if laws:
-        traces += _ask(problem, values, rest, basis, laws, scales)
+        found += _ask(problem, values, rest, basis, laws, scales)
     for batch in _by_structure([q for q in costly if q.effect.structural], problem):
-        traces += _ask(problem, values, rest, basis, batch, scales)
-    return sorted(traces, key=lambda t: -t.gain)
+        found += _ask(problem, values, rest, basis, batch, scales)
+    return sorted(found, key=lambda t: -t.gain)
 
 
 def _costly(question: Question) -> bool:
@@ -124,17 +125,19 @@ def _costly(question: Question) -> bool:
     return question.effect.structural or question.effect.overrides("law")
 
 
-def where_something_is(plain: list[Question], traces: list[Trace], costly: list[Question]) -> list[Question]:
+def where_something_is(
+    plain: Sequence[Question], found: Sequence[Sensitivity], costly: Sequence[Question], rules: Selection
+) -> list[Question]:
     """Questions about places at which some simpler effect explains something, of what the best explains anywhere.
 
     What an effect does at a joint follows its command, position, velocity, acceleration or load, and so does what one
     of the simpler ones does there. A place that is passed over is asked about again once others are explained.
     """
     best = dict.fromkeys((q.place for q in plain if len(q.places) == 1), 0.0)
-    for trace in traces:
-        if len(trace.question.places) == 1:
-            best[trace.question.place] = max(best[trace.question.place], trace.gain)
-    least = SLIGHT * max(best.values(), default=0.0)
+    for one in found:
+        if len(one.question.places) == 1:
+            best[one.question.place] = max(best[one.question.place], one.gain)
+    least = rules.costly_share * max(best.values(), default=0.0)
     return [q for q in costly if len(q.places) > 1 or best.get(q.place, least) >= least]
 
 
@@ -181,7 +184,7 @@ def _ask(
     basis: FloatArray,
     asked: list[Question],
     scales: Scales,
-) -> list[Trace]:
+) -> list[Sensitivity]:
     """Simulate questions that share a set of terms."""
     where = problem.where
     model, columns = Model(problem.terms, values), {}
@@ -194,13 +197,13 @@ def _ask(
         model = model.with_(term, term.neutral)
     wide, neutral = problem.with_model(model), model.values
     # one simulation carries one direction of one question in each subtree
-    lanes: dict[int, list[tuple[int, int]]] = {}
+    groups: dict[int, list[tuple[int, int]]] = {}
     for i, question in enumerate(asked):
         for d in range(len(question.probe)):
-            lanes.setdefault(_subtree(question, where), []).append((i, d))
-    alone = lanes.pop(WHOLE_ROBOT, [])
-    depth = max((len(lane) for lane in lanes.values()), default=0)
-    jobs = [[lane[k] for lane in lanes.values() if k < len(lane)] for k in range(depth)]
+            groups.setdefault(_subtree(question, where), []).append((i, d))
+    alone = groups.pop(WHOLE_ROBOT, [])
+    depth = max((len(group) for group in groups.values()), default=0)
+    jobs = [[group[k] for group in groups.values() if k < len(group)] for k in range(depth)]
     jobs += [[item] for item in alone]
     candidates = np.tile(neutral, (1 + len(jobs), 1))
     for row, job in enumerate(jobs, start=1):
@@ -210,7 +213,7 @@ def _ask(
                 candidates[row, columns[question.effect, place]] = question.probe[d]
     subtree_of_row = wide._subtrees[1]
     responses: dict[tuple[int, int], FloatArray | None] = {}
-    rows_of = {subtree: np.flatnonzero(subtree_of_row == subtree) for subtree in lanes}
+    rows_of = {subtree: np.flatnonzero(subtree_of_row == subtree) for subtree in groups}
     everywhere = np.arange(len(rest))
     asks = [[], *jobs]  # the first candidate asks nothing: the others are compared with it
     for first in range(0, len(candidates), BLOCK):
@@ -225,17 +228,17 @@ def _ask(
     least = NO_RESPONSE * float(rest @ rest) / len(rest)
     parts = {subtree: _Part(rows, basis[rows], rest[rows]) for subtree, rows in rows_of.items()}
     whole = _Part(everywhere, basis, rest)
-    traces = []
+    found = []
     for i, question in enumerate(asked):
         seen = [responses[i, d] for d in range(len(question.probe))]
         known = [c for c in seen if c is not None]
         if len(known) < len(seen):
             continue
         part = parts.get(_subtree(question, where), whole)
-        trace = _judge(question, part, np.column_stack(known), least, scales)
-        if trace is not None:
-            traces.append(trace)
-    return traces
+        answer = _judge(question, part, np.column_stack(known), least, scales)
+        if answer is not None:
+            found.append(answer)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +252,7 @@ class _Part:
 
 def _judge(
     question: Question, part: _Part, response: FloatArray, least: float, scales: Scales
-) -> Trace | None:
+) -> Sensitivity | None:
     """How much of the residual legal multiples of a response explain; None of one below `least`, squared."""
     coefficients = part.basis.T @ response
     projected = response - part.basis @ coefficients
@@ -264,7 +267,7 @@ def _judge(
     values = question.effect.combine(scale_at(scales, question.place), question.probe, amounts)
     if values is None or gain <= 0:
         return None
-    return Trace(question, part.rows, projected, amounts, gain, values)
+    return Sensitivity(question, part.rows, projected, amounts, gain, values)
 
 
 def _legal(effect: type[Effect], gram: FloatArray, target: FloatArray) -> FloatArray:

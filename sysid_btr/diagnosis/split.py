@@ -7,28 +7,20 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.selection import Selection, hidden_columns
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import BLOCK
 
-LEFT = 0.1
-"""Fraction of a log that stays held out, at least."""
-BRIEF = 3
-"""Stretches of half a second that hold nearly all of what happens once, and cannot be shared out."""
-MOSTLY = 0.5
-"""Fraction of the held-out excess that must show only there."""
-NEARLY = 0.9
-"""Fraction of an excess that counts as nearly all."""
 
-
-def later_split(study: Study, fitted: Fitted, limit: FloatArray) -> Study | None:
+def later_split(study: Study, fitted: Fitted, rules: Selection) -> Study | None:
     """The study with half of the held-out excess moved to the fitted part; None where that is no help.
 
     Parameters
     ----------
     study : as laid out.
     fitted : a model that explains the fitted part, but not the held-out one.
-    limit : (columns,) chi2 up to which a column shows nothing.
+    rules : what counts as explained, and how much may move.
 
     Returns
     -------
@@ -38,9 +30,8 @@ def later_split(study: Study, fitted: Fitted, limit: FloatArray) -> Study | None
     """
     if study.free or len(fitted.train_columns) != len(fitted.holdout_columns) or not any(study.split):
         return None
-    hidden = (fitted.train_columns <= limit) & (fitted.holdout_columns > limit)
-    above = np.maximum(fitted.holdout_columns - 1, 0.0)
-    if above[hidden].sum() < MOSTLY * above.sum() or not hidden.any():
+    hidden = hidden_columns(rules, fitted)
+    if hidden is None:
         return None
     problem = study.holdout_problem(fitted.model)
     residual = problem.residuals(fitted.model.values[None])[0]
@@ -51,7 +42,7 @@ def later_split(study: Study, fitted: Fitted, limit: FloatArray) -> Study | None
     for i, log in enumerate(study.holdout):
         time = log.time - log.time[0]
         count = int(time[-1] / BLOCK) + 1
-        cut = _cut(np.maximum(by_block[first : first + count], 0.0), split[i], float(time[-1]))
+        cut = _cut(np.maximum(by_block[first : first + count], 0.0), split[i], float(time[-1]), rules)
         first += count
         if cut > split[i]:
             size = int(np.searchsorted(time, cut))
@@ -61,13 +52,13 @@ def later_split(study: Study, fitted: Fitted, limit: FloatArray) -> Study | None
     return replace(study, train=tuple(train), split=tuple(split))
 
 
-def _cut(excess: FloatArray, now: float, end: float) -> float:
+def _cut(excess: FloatArray, now: float, end: float, rules: Selection) -> float:
     """Time (s) that halves the excess, or that follows all of it where it is brief."""
     total = float(excess.sum())
-    latest = end - LEFT * end
+    latest = end - rules.least_holdout * end
     if total == 0 or now >= latest:
         return now
     share = np.cumsum(excess) / total
-    begin, half, nearly = (int(np.searchsorted(share, s)) for s in (1 - NEARLY, 0.5, NEARLY))
-    last = nearly if nearly - begin < BRIEF else half
+    begin, half, nearly = (int(np.searchsorted(share, s)) for s in (1 - rules.nearly, 0.5, rules.nearly))
+    last = nearly if nearly - begin < rules.brief else half
     return min((last + 1) * BLOCK, latest)

@@ -1,0 +1,173 @@
+"""Backward elimination: what data do not miss goes; what stays is merged, fitted to the end, and given intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.selection import (
+    Selection,
+    agree,
+    distance_from_nothing,
+    doubtful_location,
+    is_dispensable,
+    is_needed,
+    predicts_as_well,
+)
+from sysid_btr.diagnosis.state import State
+from sysid_btr.diagnosis.trials import Trial, attempt
+from sysid_btr.diagnosis.uncertainty import with_intervals
+from sysid_btr.estimators.base import Progress
+from sysid_btr.identify.refit import inflate, refit, shorten
+from sysid_btr.identify.study import Study
+from sysid_btr.terms.effect import Effect
+
+
+def eliminate(state: State, rules: Selection, progress: Progress) -> State:
+    """The model with only those effects that data want, at the optimum and with intervals."""
+    state, removed = _prune(state, rules)
+    if removed:
+        state = state.step(removed=removed)
+    if not state.effects:
+        return state
+    state = _merged(state, rules)
+    study = inflate(state.study, state.fitted, memory=True)
+    progress(done=rules.rounds, total=None, best=state.fitted.holdout, note="final fit")
+    polished = refit(study, state.fitted.model, polish=True, progress=progress)
+    state = replace(state, study=study, fitted=polished).spent(polished.evaluations)
+    progress(done=rules.rounds, total=None, best=state.fitted.holdout, note="intervals")
+    state = with_intervals(state, rules)
+    real = _distinguishable_from_nothing(state, rules)
+    if real is not None:
+        state = with_intervals(real.step(removed=_gone(state, real)), rules)
+    return state
+
+
+def thinned(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:
+    """A trial without those locations of its group whose small amounts data do not miss; and what that took."""
+    spent, effect = 0, trial.hypothesis.effect
+    neutral = trial.hypothesis.term(study.scales).neutral[effect.main]
+    while not trial.hypothesis.shared and 1 < len(trial.hypothesis.places) <= rules.largest_group:
+        places, model = trial.hypothesis.places, trial.fitted.model
+        group = model.terms[-1]
+        amounts = model.own(group).reshape(-1, len(effect.kinds))
+        size = np.abs(amounts[:, effect.main] - neutral)
+        least = doubtful_location(rules, size)
+        if least is None:
+            break
+        rest = np.delete(np.arange(len(size)), least)
+        smaller = replace(trial.hypothesis, places=tuple(places[i] for i in rest), start=amounts[rest].ravel())
+        fewer = attempt(study, model.without(group), smaller, rules)
+        spent += fewer.fitted.evaluations
+        loss = (
+            fewer.fitted.misfit_everywhere - trial.fitted.misfit_everywhere
+            if effect.passing
+            else fewer.fitted.misfit - trial.fitted.misfit
+        )
+        if not is_dispensable(rules, float(size[least]), float(size.max()), loss):
+            break
+        trial = fewer
+    return trial, spent
+
+
+def _prune(state: State, rules: Selection) -> tuple[State, list[str]]:
+    """Drop effects, and then locations of effects, that were in demand only until a later effect was found."""
+    removed: list[str] = []
+    found = state.effects if len(state.effects) > 1 else ()
+    for effect in found[:-1]:
+        short, rest = shorten(state.study, rules.refit_seconds), state.fitted.model.without(effect)
+        trial = refit(short, rest, judged=state.study)
+        state = state.spent(trial.evaluations)
+        if not is_needed(rules, trial, state.fitted):
+            removed.append(f"{effect.name} at {', '.join(effect.places)}")
+            state = replace(state, fitted=trial, rivals=state.without_rivals_of(effect))
+    for effect in state.effects if len(state.effects) > 1 else ():
+        state, dropped = _thinned_again(state, effect, rules)
+        if dropped:
+            removed.append(f"{effect.name} at {', '.join(dropped)}")
+    return state, removed
+
+
+def _thinned_again(state: State, effect: Effect, rules: Selection) -> tuple[State, tuple[str, ...]]:
+    """The state with an effect at fewer locations, and those that are dropped."""
+    if effect.shared:
+        return state, ()
+    amounts = state.fitted.model.own(effect)
+    whole = Hypothesis(type(effect), effect.places, False, amounts, 0.0)
+    now = replace(state.fitted, model=state.fitted.model.without(effect).with_(effect, amounts))
+    left, spent = thinned(state.study, Trial(whole, now), rules)
+    state = state.spent(spent)
+    dropped = tuple(p for p in effect.places if p not in left.hypothesis.places)
+    if not dropped:
+        return state, ()
+    own = state.rivals[state.effects.index(effect)]
+    return replace(state, fitted=left.fitted, rivals=(*state.without_rivals_of(effect), own)), dropped
+
+
+def _merged(state: State, rules: Selection) -> State:
+    """Effects of one kind found in several rounds become one; amounts that agree become one amount."""
+    pieces: dict[type[Effect], list[tuple[str, FloatArray]]] = {}
+    confused: dict[type[Effect], tuple[str, ...]] = {}
+    for effect, rivals in zip(state.effects, state.rivals, strict=True):
+        amounts = effect.spread(state.fitted.model.own(effect)[None])[0]
+        pieces.setdefault(type(effect), []).extend(zip(effect.places, amounts, strict=True))
+        confused[type(effect)] = tuple(dict.fromkeys((*confused.get(type(effect), ()), *rivals)))
+    model = state.fitted.model.without(*state.effects)
+    for kind, found in pieces.items():
+        places = tuple(p for p, _ in found)
+        amounts = np.array([a for _, a in found])
+        even = len(found) > 2 and agree(amounts[:, kind.main], rules.common_amount)
+        values = np.median(amounts, axis=0) if even else amounts.ravel()
+        model = model.with_(kind.at(places, state.study.scales, shared=even).around(values), values)
+    # what is in the model beside an effect is not its rival
+    present = {kind.name for kind in pieces}
+    kept = tuple(tuple(name for name in names if name not in present) for names in confused.values())
+    return replace(state, fitted=replace(state.fitted, model=model), rivals=kept)
+
+
+def _distinguishable_from_nothing(state: State, rules: Selection) -> State | None:
+    """The model without effects, and locations of effects, whose amounts may be nothing; None where there are none.
+
+    Only what held-out data do not miss is dropped: of two effects that a log shows together but cannot distinguish, one
+    stays.
+    """
+    doubtful: list[tuple[float, Effect, list[int]]] = []
+    for effect in state.effects:
+        own = state.estimates[state.fitted.model.terms.columns(effect)]
+        main = slice(effect.main, None, len(effect.kinds))
+        distance = [distance_from_nothing(e, n) for e, n in zip(own[main], effect.neutral[main], strict=True)]
+        kept = [i for i, d in enumerate(distance) if np.isinf(d)]
+        if len(kept) < len(distance):
+            doubtful.append((min(distance), effect, kept))
+    result: State | None = None
+    now = state
+    for _, effect, kept in sorted(doubtful, key=lambda item: item[0]):
+        if not kept and len(now.effects) == 1:
+            break
+        at = now.effects.index(effect)
+        left = _at_locations(effect, kept, now)
+        fitted = refit(now.study, now.fitted.model.replaced(effect, *left), polish=True)
+        if predicts_as_well(rules, fitted, state.fitted):
+            rivals = (*now.rivals[:at], *((now.rivals[at],) if left else ()), *now.rivals[at + 1 :])
+            result = now = replace(now, fitted=fitted, rivals=rivals)
+    return result
+
+
+def _at_locations(effect: Effect, kept: Sequence[int], state: State) -> list[tuple[Effect, FloatArray]]:
+    """An effect at some of its locations alone, with its amounts there; nothing of none."""
+    if not kept:
+        return []
+    amounts = state.fitted.model.own(effect).reshape(-1, len(effect.kinds))[kept].ravel()
+    places = [effect.places[i] for i in kept]
+    return [(type(effect).at(places, state.study.scales).around(amounts), amounts)]
+
+
+def _gone(before: State, after: State) -> tuple[str, ...]:
+    """What is named before and not after."""
+    staying = {(e.name, e.variant, p) for e in after.effects for p in e.places}
+    gone = [(e, [p for p in e.places if (e.name, e.variant, p) not in staying]) for e in before.effects]
+    return tuple(f"{e.name} at {', '.join(places)}" for e, places in gone if places)

@@ -1,0 +1,177 @@
+"""Forward search: scan for what is missing, refit the leading hypotheses, add the best; again until nothing helps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.elimination import thinned
+from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
+from sysid_btr.diagnosis.scan import Question, Sensitivity, questions, scan
+from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain
+from sysid_btr.diagnosis.signature import proposals
+from sysid_btr.diagnosis.state import State
+from sysid_btr.diagnosis.trials import (
+    Trial,
+    attempt,
+    candidates_of,
+    choose,
+    is_hopeless,
+    is_outdone,
+    is_rival,
+    is_superfluous,
+)
+from sysid_btr.estimators.base import Progress
+from sysid_btr.estimators.journal import Record
+from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.refit import refit, robust_refit, shorten
+from sysid_btr.models.robot import body_names, joint_names, servo_joints
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.effect import Effect
+
+Library = Sequence[type[Effect]]
+Say = Callable[[str], None]
+
+
+def search(state: State, library: Library, rules: Selection, progress: Progress) -> State:
+    """Add effects one at a time until nothing is left to explain, or nothing helps."""
+    for number in range(1, rules.rounds + 1):
+        if at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted):
+            break
+        now = state.fitted
+
+        def say(note: str, number: int = number, best: float = now.holdout) -> None:
+            progress(done=number, total=None, best=best, note=f"round {number}: {note}")
+
+        state, trials = _try_promising(state, library, rules, say)
+        worthy = [
+            t
+            for t in trials
+            # what others leave unexplained at some moment looks like a push
+            if has_minimum_gain(
+                rules,
+                state.before,
+                now,
+                t.fitted,
+                transient=t.hypothesis.effect.passing and bool(state.effects),
+            )
+        ]
+        winner = choose(rules, now, worthy)
+        if winner is None:
+            break
+        state = _add(state, winner, trials, rules)
+    return state
+
+
+def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:
+    """Refit the hypotheses of a scan, the most promising first, while they may matter."""
+    say("scan")
+    hypotheses, answers = _promising(state, library, rules)
+    state = state.spent(answers)
+    trials: list[Trial] = []
+    for hypothesis in hypotheses:
+        if is_superfluous(rules, hypothesis, trials) or is_outdone(rules, hypothesis, trials):
+            continue
+        if is_hopeless(rules, hypothesis, hypotheses[0], len(trials)):
+            break
+        trial = attempt(state.study, state.fitted.model, hypothesis, rules)
+        trials.append(trial)
+        say(f"with {hypothesis} held-out chi2 {trial.fitted.holdout:.4g}")
+        state = state.spent(trial.fitted.evaluations)
+    if not state.candidates or state.effects:
+        state = replace(state, candidates=(*state.candidates, *candidates_of(rules, state.fitted, trials)))
+    return state, trials
+
+
+def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection) -> State:
+    """The state with the winner of a round, all of it refitted."""
+    study = state.study
+    if winner.fitted.numerics != study.numerics:
+        study = replace(study, numerics=winner.fitted.numerics)
+    kept, spent = thinned(study, winner, rules)
+    hypothesis, fitted = kept.hypothesis, kept.fitted
+    rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
+    # a more general effect takes the place of the special case it includes
+    gone = [
+        e
+        for e in state.effects
+        if (e.label or e.name) in hypothesis.effect.includes and set(e.places) <= set(hypothesis.places)
+    ]
+    staying = [r for e, r in zip(state.effects, state.rivals, strict=True) if e not in gone]
+    if gone:
+        rest = fitted.model.without(*gone, fitted.model.terms[-1])
+        fitted = refit(study, rest.with_(hypothesis.term(study.scales), hypothesis.start))
+    if study.free:
+        study = study.settled(fitted.model)
+    study, fitted = robust_refit(study, fitted, 1)
+    state = replace(state, study=study, fitted=fitted, rivals=(*staying, rivals)).spent(spent + fitted.evaluations)
+    return state.step(added=(str(hypothesis),))
+
+
+def _promising(state: State, library: Library, rules: Selection) -> tuple[list[Hypothesis], int]:
+    """The leading hypotheses of a scan, and how many questions were answered; an interrupted run noted them."""
+    study, values = state.study, state.fitted.model.values[None]
+    places = (*joint_names(study.robot), *body_names(study.robot), "robot")
+    known = None if study.journal is None else study.journal.replay("scan", values, whole=True)
+    if known is not None:
+        return from_arrays(known.arrays, library, places), int(known.arrays["answers"])
+    began = perf_counter()
+    found, residuals = _scan(state, library, rules)
+    hypotheses = form_hypotheses(found, residuals, rules)
+    if study.journal is not None:
+        arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
+        seconds = study.journal.seconds + perf_counter() - began
+        study.journal.append(Record("scan", values, arrays, seconds))
+    return hypotheses, len(found)
+
+
+def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensitivity], int]:
+    """What every effect would do to the residual, best first, and the number of residuals."""
+    study, model = state.study, state.fitted.model
+    problem = shorten(study, rules.scan_seconds).train_problem(model)
+    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
+    asked = _questions(state, library, problem, residual, rules)
+    if study.free and len(asked) > rules.glance_most:
+        glance = shorten(study, rules.glance_seconds).train_problem(model)
+        linear = linearise(glance, model.values, step=study.stencil(model.terms))
+        seen = scan(glance, model.values, *linear, asked, study.scales, rules)
+        asked = [s.question for s in seen[: rules.glance_most]]
+    # what is left is the right integrator's; what an effect would change may be a little off
+    cheap = problem.with_numerics(study.cheap)
+    found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
+    if rules.alike:
+        # one hypothesis an effect, begun at its best working point: initial guesses hold other amounts
+        best: dict[type[Effect], Sensitivity] = {}
+        for one in found:
+            best.setdefault(one.question.effect, one)
+        found = list(best.values())
+    return found, len(residual)
+
+
+def _questions(
+    state: State, library: Library, problem: ReplayProblem, residual: FloatArray, rules: Selection
+) -> list[Question]:
+    """What a scan asks for: an effect already at a location is not, as it is refitted with everything else."""
+    study = state.study
+    places = {
+        "joint": joint_names(study.robot),
+        "servo": servo_joints(study.robot),
+        "body": body_names(study.robot),
+        "robot": ("robot",),
+    }
+    asked: list[Question] = questions(library, places, study.scales)
+    if rules.alike:
+        asked = [q for q in asked if len(q.places) > 1 or q.effect.scope == "robot"]
+    else:
+        asked += proposals(study, problem, state.fitted.model.values, residual, library)
+    present = {(type(e), p) for e in state.effects for p in e.places}
+    split = {p for e in state.effects if e.structural for p in e.places}
+    return [
+        q
+        for q in asked
+        if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
+    ]

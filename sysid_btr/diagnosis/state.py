@@ -1,0 +1,72 @@
+"""What a diagnosis knows at some point of its way: one value that every stage takes and returns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from sysid_btr.diagnosis.closing import Candidate, StepRecord
+from sysid_btr.estimators.journal import Journal
+from sysid_btr.identify.fit import Fit
+from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.refit import Fitted, inflated, judge
+from sysid_btr.identify.study import Study
+from sysid_btr.terms.effect import Effect
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The model so far, and how it came about.
+
+    Attributes
+    ----------
+    study : robot and logs, with the noise and the numerics that the model so far asks for.
+    first : fit of the declared parameters, the model's first terms.
+    before : the same as judged when the search began.
+    fitted : the model so far.
+    rivals : for each effect, what it may be confused with.
+    steps, candidates : for the record.
+    replays : candidates simulated.
+    estimates : of all parameters; of the declared ones until effects have intervals.
+    reported : the model as it is reported, with what cannot be identified fixed; None before there are intervals.
+    """
+
+    study: Study
+    first: Fit
+    before: Fitted
+    fitted: Fitted
+    rivals: tuple[tuple[str, ...], ...]
+    steps: tuple[StepRecord, ...]
+    candidates: tuple[Candidate, ...]
+    replays: int
+    estimates: tuple[Estimate, ...]
+    reported: Fitted | None = None
+
+    @classmethod
+    def of(cls, first: Fit, journal: Journal | None) -> State:
+        """The state after the declared parameters were fitted; refits are recorded in a section of a journal."""
+        study = replace(first.study, journal=None if journal is None else journal.section())
+        # hypotheses are compared where each fits best
+        study, before = inflated(study, judge(study, first.model.at(first.optimum), first.replays))
+        steps = (StepRecord((), (), before.train, before.holdout),)
+        return cls(study, first, before, before, (), steps, (), first.replays, first.estimates)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The terms that were added to the declared ones."""
+        added = self.fitted.model.terms[len(self.first.model.terms) :]
+        return tuple(term for term in added if isinstance(term, Effect))
+
+    def spent(self, replays: int) -> State:
+        """The same after more simulations."""
+        return replace(self, replays=self.replays + replays)
+
+    def step(self, added: Sequence[str] = (), removed: Sequence[str] = ()) -> State:
+        """The same with what was added or removed on record."""
+        record = StepRecord(tuple(added), tuple(removed), self.fitted.train, self.fitted.holdout)
+        return replace(self, steps=(*self.steps, record))
+
+    def without_rivals_of(self, effect: Effect) -> tuple[tuple[str, ...], ...]:
+        """The rivals of all other effects."""
+        at = self.effects.index(effect)
+        return self.rivals[:at] + self.rivals[at + 1 :]

@@ -1,0 +1,152 @@
+"""Trying hypotheses: the model with one of them added, refitted; and which of several trials is the best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid_btr.diagnosis.closing import Candidate
+from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once
+from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
+from sysid_btr.identify.study import Study
+from sysid_btr.terms.model import Model
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A hypothesis, and the model that it was added to, as its last term, and that was refitted."""
+
+    hypothesis: Hypothesis
+    fitted: Fitted
+
+
+def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
+    """The model with a hypothesis added, refitted from the best of its initial guesses."""
+    guesses = hypothesis.initial_guesses()
+    terms = rest.with_(hypothesis.term(study.scales), guesses[0]).terms
+    starts = np.column_stack([np.tile(rest.values, (len(guesses), 1)), guesses])
+    seconds = rules.refit_seconds if len(starts) <= rules.start_few else rules.start_seconds
+    spent = 0
+    while True:
+        start = best_start(shorten(study, seconds), terms, starts)
+        found = refit(shorten(study, rules.refit_seconds), Model(terms, start), judged=study)
+        spent += found.evaluations + len(starts)
+        finer = study.numerics.halved()
+        given_up = study.free or finer.integrator == "Euler" or finer.timestep < rules.finest_step
+        if np.isfinite(found.holdout) or given_up:
+            return Trial(hypothesis, replace(found, evaluations=spent))
+        # a stiff spring on a light body can be too fast for the step
+        study = replace(study, numerics=finer)
+
+
+# --- what is worth a refit ---------------------------------------------------------------------------------
+
+
+def is_superfluous(rules: Selection, hypothesis: Hypothesis, trials: Sequence[Trial]) -> bool:
+    """Whether another trial explains all there is and this one, which is no simpler, promises much less."""
+    for other in trials:
+        enough = rules.settled if hypothesis.complexity >= other.hypothesis.complexity else rules.hopeless
+        if at_floor(rules, other.fitted) and hypothesis.gain < enough * other.hypothesis.gain:
+            return True
+    return False
+
+
+def is_outdone(rules: Selection, hypothesis: Hypothesis, trials: Sequence[Trial]) -> bool:
+    """Whether another law of the same effect at the same locations did far worse than the best hypothesis."""
+    best = min((t.fitted.misfit for t in trials), default=np.inf)
+    return any(
+        t.fitted.misfit > best + rules.outdone
+        for t in trials
+        if t.hypothesis.effect is not hypothesis.effect
+        and t.hypothesis.effect.name == hypothesis.effect.name
+        and set(t.hypothesis.places) == set(hypothesis.places)
+    )
+
+
+def is_hopeless(rules: Selection, hypothesis: Hypothesis, best: Hypothesis, tried: int) -> bool:
+    """Whether a hypothesis promises much less than the most promising one, when some were tried."""
+    return tried >= rules.least_refits and hypothesis.gain < rules.hopeless * best.gain
+
+
+# --- which one wins ---------------------------------------------------------------------------------------
+
+
+def choose(rules: Selection, before: Fitted, trials: Sequence[Trial]) -> Trial | None:
+    """The simplest of the best hypotheses, if data want one at all.
+
+    What happens once, and cannot be held out, wins where it explains more of all data than what lasts; what shows only
+    in the fitted part wins where held-out data want nothing.
+    """
+    lasting = [t for t in trials if np.isfinite(t.fitted.holdout) and improves(rules, before, t.fitted)]
+    once = [t for t in trials if t.hypothesis.effect.passing and improves_once(rules, before, t.fitted)]
+    if once:
+        event = min(once, key=_misfit_everywhere)
+        others = [_misfit_everywhere(t) for t in lasting if not t.hypothesis.effect.passing]
+        if _misfit_everywhere(event) < min(others, default=np.inf) - rules.simpler:
+            return event
+    if lasting:
+        return _simplest(rules, lasting)
+    fitted = [t for t in trials if explains_fitted(rules, before, t.fitted)]
+    if not fitted:
+        return None
+    best = min(_misfit_everywhere(t) for t in fitted)
+    near = [t for t in fitted if _misfit_everywhere(t) <= best + rules.simpler]
+    return min(near, key=lambda t: (t.hypothesis.complexity, _misfit_everywhere(t)))
+
+
+def _misfit_everywhere(trial: Trial) -> float:
+    return trial.fitted.misfit_everywhere
+
+
+def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
+    """The simplest of those near the best, or what beats it beyond chance and is no refinement of it."""
+
+    def order(trial: Trial) -> tuple[int, float]:
+        return trial.hypothesis.complexity, trial.fitted.misfit
+
+    best = min(t.fitted.misfit for t in trials)
+    near = [t for t in trials if t.fitted.misfit <= best + rules.simpler]
+    named = {t.hypothesis.effect.name for t in near}
+    near = [t for t in near if not named & set(t.hypothesis.effect.yields_to)]
+    simplest = min(near, key=order)
+    others = [t for t in near if _is_another(t.hypothesis, simplest.hypothesis)]
+    better = [t for t in others if t.fitted.misfit < simplest.fitted.misfit]
+    return min([t for t in better if paired_t(t.fitted, simplest.fitted) > rules.t] or [simplest], key=order)
+
+
+def _is_another(hypothesis: Hypothesis, simple: Hypothesis) -> bool:
+    """Whether a hypothesis is of another effect than a simple one, and no generalisation of it."""
+    return hypothesis.effect.name != simple.effect.name and simple.effect.name not in hypothesis.effect.includes
+
+
+def is_rival(rules: Selection, winner: Trial, other: Trial) -> bool:
+    """Whether another effect does nearly as well, and held-out data cannot decide."""
+    effect, rival = winner.hypothesis.effect, other.hypothesis.effect
+    if rival.name == effect.name or effect.name in (*rival.includes, *rival.yields_to):
+        return False
+    if other.fitted.misfit > winner.fitted.misfit + rules.rival:
+        return False
+    return paired_t(winner.fitted, other.fitted) < rules.t
+
+
+def candidates_of(rules: Selection, before: Fitted, trials: Sequence[Trial]) -> list[Candidate]:
+    """What was weighed, best first, with the fraction of the held-out excess that it removes."""
+    ordered = sorted(trials, key=lambda t: t.fitted.misfit)
+    excess = max(before.holdout - 1.0, 1e-9)
+    result = []
+    for trial in ordered:
+        effect, fitted = trial.hypothesis.effect, trial.fitted
+        gain = (before.holdout - fitted.holdout) / excess
+        alike = (
+            other.hypothesis.effect.name
+            for other in ordered
+            if other.hypothesis.effect.name != effect.name
+            and gain > 0
+            and abs(other.fitted.misfit - fitted.misfit) < rules.rival
+        )
+        amplitude = float(fitted.model.own(fitted.model.terms[-1])[effect.main])
+        result.append(Candidate(effect.name, trial.hypothesis.places, gain, amplitude, tuple(dict.fromkeys(alike))))
+    return result

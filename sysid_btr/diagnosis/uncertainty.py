@@ -1,0 +1,52 @@
+"""Intervals of all parameters in the final model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.state import State
+from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.fixing import fix_unidentifiable
+from sysid_btr.identify.fusion import weigh_walks
+from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.refit import judge, refit
+from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
+
+
+def with_intervals(state: State, rules: Selection) -> State:
+    """The state with estimates of all parameters, and with the model as it is reported.
+
+    The step is halved while it moves an estimate by more than its error. The fitted model stays where the residuals are
+    least, also where the motion of walks tells more than these do.
+    """
+    study = state.study
+    for refinement in range(rules.refinements + 1):
+        model = state.fitted.model
+        problem = study.train_problem(model)
+        if refinement == 0:
+            residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
+            jacobian = np.nan_to_num(jacobian)
+        else:  # what half the step changes in the derivatives is far less than what is known of them
+            residual = problem.residuals(model.values[None])[0]
+        shift, known = numerics_shift(problem, model.values, jacobian, residual), None
+        if study.free:
+            weighed = weigh_walks(study, problem, model.values, jacobian, residual)
+            jacobian, residual = weighed.jacobian, weighed.residual
+            shift, known = np.hypot(shift, weighed.error), weighed.known
+            model = model.at(weighed.values)
+        found = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks, shift, known)
+        bare = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks)
+        clear = np.array([e.identifiable != "no" for e in bare])
+        worst = np.max(np.abs(shift[clear]) / np.maximum([e.std for e in bare], 1e-300)[clear], initial=0.0)
+        settled = worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or study.free
+        if settled or refinement == rules.refinements:
+            break
+        study = replace(study, numerics=study.numerics.halved())
+        state = replace(state, fitted=refit(study, model, iterations=4))
+    values, found, _ = fix_unidentifiable(problem, model.values, found, jacobian, known)
+    last = judge(study, model.at(values))
+    fitted = last if known is None else state.fitted
+    return replace(state, study=study, fitted=fitted, estimates=found, reported=last)
