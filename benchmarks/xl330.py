@@ -27,7 +27,6 @@ from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
-from sysid_btr.diagnosis.selection import Selection
     from sysid_btr.identify.study import Study
 
 FOLDS = ("none", "kp100", "kp200", "kp400")
@@ -47,7 +46,7 @@ EFFECTS = (
     "joint_spring",
 )
 """Friction, drive and mounting: what a servo on a bench can have. `--effects all` considers the whole library."""
-LADDER = Selection(minimum_gain=2e-4)
+MINIMUM_GAIN = 2e-4
 """As many rungs as help to predict."""
 SEARCH, FINAL = 0.005, 0.0025
 """Steps, s, of the search and of the final fit."""
@@ -84,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     """Close the loop on the logs that are not held out, then refit rung by rung."""
     from sysid_btr.diagnosis.close import close
+    from sysid_btr.diagnosis.selection import Selection
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import read_log
     from sysid_btr.models.xl330 import xl330
@@ -99,7 +99,7 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     study = make_study(
         xl330(), kept, channels=("position",), numerics=Numerics("RK4", SEARCH), threads=1
     )
-    found = close(study, list(DECLARED), effects=effects, progress=tell, selection=LADDER)
+    found = close(study, list(DECLARED), effects=effects, progress=tell, selection=Selection(minimum_gain=MINIMUM_GAIN))
     # every log in full, and all alike
     whole = make_study(
         xl330(), logs, channels=("position",), numerics=Numerics("RK4", FINAL), threads=1
