@@ -18,10 +18,10 @@ import numpy as np
 
 from benchmarks.btr_seeds import loop, study
 from sysid_btr.btr.controllers import Controller, ant_gait
-from sysid_btr.btr.loop import BackToReality, Settings, model_search, papers_model_search
+from sysid_btr.btr.outcome import BackToReality, estimate_model
 from sysid_btr.btr.problems import ControllerProblem, Stage
-from sysid_btr.btr.result import estimate_model
 from sysid_btr.btr.robot import HiddenRobot, Noise
+from sysid_btr.btr.settings import Settings, model_search, papers_model_search
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.world import make_world
 from sysid_btr.estimators import Budget, GeneticAlgorithm, Journal, silent

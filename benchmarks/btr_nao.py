@@ -27,16 +27,11 @@ from benchmarks.btr_seeds import loop, study
 from benchmarks.paper_nao import V32
 from sysid_btr.btr.choice import get_choice, pool_of
 from sysid_btr.btr.controllers import Controller, NaoGait
-from sysid_btr.btr.loop import (
-    BackToReality,
-    Settings,
-    cma_controller_searches,
-    controller_search,
-    first_controller_search,
-)
 from sysid_btr.btr.map_problem import model_fit
+from sysid_btr.btr.outcome import BackToReality
 from sysid_btr.btr.problems import ControllerProblem, Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise
+from sysid_btr.btr.settings import Settings, cma_controller_searches, controller_search, first_controller_search
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook
 from sysid_btr.btr.world import make_world

@@ -9,9 +9,10 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
-from sysid_btr.btr.loop import BackToReality, Settings, back_to_reality
-from sysid_btr.btr.result import btr_result
+from sysid_btr.btr.loop import back_to_reality
+from sysid_btr.btr.outcome import BackToReality
 from sysid_btr.btr.robot import HiddenRobot
+from sysid_btr.btr.settings import Settings
 from sysid_btr.models.robot import Robot
 from sysid_btr.report.btr import draw_btr
 from sysid_btr.result import to_json
@@ -91,7 +92,7 @@ def loop(
         threads=threads,
         say=lambda text: print(f"seed {robot.seed} ({process_time() - cpu:.0f} s CPU): {text}", flush=True),
     )
-    result = btr_result(outcome)
+    result = outcome.to_dict()
     (folder / "result.json").write_text(to_json(result))
     (folder / "fig3.png").write_bytes(draw_btr(result, truth=truth))
     return outcome

@@ -15,11 +15,12 @@ from sysid_btr.btr.closing import Joined, _tell_apart, join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
-from sysid_btr.btr.loop import BackToReality, Iteration, Settings, back_to_reality, disengaged
+from sysid_btr.btr.loop import back_to_reality, disengaged
 from sysid_btr.btr.map_problem import Beginnings, model_fit
+from sysid_btr.btr.outcome import BackToReality, Iteration, estimate_model
 from sysid_btr.btr.problems import ControllerProblem, ModelProblem, Stage
-from sysid_btr.btr.result import btr_result, estimate_model
 from sysid_btr.btr.robot import SILENT, HiddenRobot, Noise, Robot, Trial
+from sysid_btr.btr.settings import Settings
 from sysid_btr.btr.study import early_logs, trial_study
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
@@ -368,7 +369,7 @@ def whole() -> BackToReality:
 
 def same(a: BackToReality, b: BackToReality) -> bool:
     strip = {"wall_s": 0.0}
-    return to_json({**btr_result(a), **strip}) == to_json({**btr_result(b), **strip})
+    return to_json({**a.to_dict(), **strip}) == to_json({**b.to_dict(), **strip})
 
 
 @pytest.mark.parametrize("where", ["1, controllers", "1, models", "2, controllers", "2, models", "trial 1", "trial 3"])
@@ -432,7 +433,7 @@ def test_a_crash_is_a_result(distance: str, tmp_path: Path) -> None:
     assert np.array_equal(outcome.iterations[0].model, [1.0, 1.0])
     content = json.loads((tmp_path / "trials" / "trial_0001.json").read_text())
     assert content["outcome"] == "crashed"
-    json.loads(to_json(btr_result(outcome)))
+    json.loads(to_json(outcome.to_dict()))
 
 
 def test_the_requirement_ends_the_loop() -> None:
@@ -473,7 +474,7 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
     assert first.model.tolist() == [1.1, 0.9, 0.02]
     assert len(second.model) == 3
     assert first.population.shape[1] == len(first.population_names) == 2
-    assert len(draw_btr(btr_result(outcome))) > 10_000
+    assert len(draw_btr(outcome.to_dict())) > 10_000
     if disk:
         assert same(tiny(hidden(), tmp_path, settings), outcome)
         assert len(asked) == 2

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -23,21 +23,19 @@ from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
 from sysid_btr.btr.map_problem import Beginnings
+from sysid_btr.btr.outcome import BackToReality, Iteration
 from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
+from sysid_btr.btr.settings import LIKELIHOOD, Settings
 from sysid_btr.btr.study import early, early_logs, trial_study
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, silent
-from sysid_btr.estimators.chain import needs_residuals
-from sysid_btr.estimators.cma_es import CmaEs
-from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot as RobotModel
-from sysid_btr.objectives.distance import get_distance
-from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
 from sysid_btr.version import __version__
 
@@ -50,178 +48,8 @@ STUCK = 0.9
 
 STEPS = {"controllers": 1, "models": 3, "models_again": 4}
 """Searches of an iteration by the paper's numbers; with a likelihood Step 3 goes on where effects joined the model."""
-LIKELIHOOD = "likelihood"
-"""The distance by which Step 3 explains the first seconds of trials, and is biased by the last model."""
 SPOILT = 1.5
 """Times the error of the fitness that the last model foresees of the trials, above which a model is not taken."""
-
-
-FLIPS, BITS = 4.3, 8
-"""Bits by which a controller's children differ from it on average, and bits of each of its numbers."""
-
-
-def controller_search(numbers: int = 36) -> GeneticAlgorithm:
-    """Step 1 as in the paper's Fig. 3: 11 generations of 20, by a few mutations of the last controller.
-
-    Parameters
-    ----------
-    numbers : of a controller.
-    """
-    mutation = min(max(round(FLIPS / (BITS * numbers), 3), 0.001), 0.5)
-    return GeneticAlgorithm(population=20, generations=11, bits=BITS, mutation=mutation)
-
-
-def first_controller_search() -> GeneticAlgorithm:
-    """Step 1 of the first iteration: far from the controller known beforehand, which may not move at all."""
-    return GeneticAlgorithm(population=20, generations=11, bits=BITS)
-
-
-def cma_controller_searches(generations: int = 11) -> tuple[CmaEs, CmaEs]:
-    """Step 1 by CMA-ES, in the first iteration and in the others: as many controllers, found by other steps."""
-    far = CmaEs(sigma=0.3, population=20, max_generations=generations)
-    return far, replace(far, sigma=0.1)
-
-
-def model_search() -> CmaEs:
-    """Step 3 with as many models as in the paper's Fig. 3, 11 generations of 15, but told apart more finely."""
-    return CmaEs(population=15, max_generations=11, sigma=0.15)
-
-
-def papers_model_search() -> GeneticAlgorithm:
-    """Step 3 as in the paper's Fig. 3: 11 generations of 15."""
-    return GeneticAlgorithm(population=15, generations=11, bits=10)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What the loop may spend and how it decides.
-
-    Attributes
-    ----------
-    iterations : at most.
-    trials : controllers tried in each (m in the paper); with a distance of sensors one or two will do.
-    first, controllers : Step 1 in the first iteration and in the others.
-    models : Step 3; least squares needs a likelihood.
-    distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse`` or ``wasserstein`` of whole trials, or the
-        ``likelihood`` of their first seconds, biased by the last model.
-    choice : of trials, ``fittest`` or ``disagreement``.
-    memory : trials that Step 3 explains, the newest first; those before are taken evenly.
-    rivals : candidate models that may disagree.
-    requirement : real fitness with which the work is done.
-    close : look for missing effects where Step 3 cannot explain the robot's logs.
-    correct : leave the model as it is and correct its fitness linearly instead (a baseline).
-    """
-
-    iterations: int = 13
-    trials: int = 12
-    first: Estimator = field(default_factory=first_controller_search)
-    controllers: Estimator = field(default_factory=controller_search)
-    models: Estimator = field(default_factory=model_search)
-    distance: str = FITNESS
-    choice: str = "fittest"
-    memory: int = 12
-    rivals: int = 5
-    requirement: float | None = None
-    close: bool = False
-    correct: bool = False
-
-    def __post_init__(self) -> None:
-        if min(self.iterations, self.trials, self.memory, self.rivals) < 1:
-            raise UsageError("btr: iterations, trials, memory and rivals must be at least 1")
-        if self.close and self.correct:
-            raise UsageError("btr: with a linear correction the model stays as it is; nothing can be added to it")
-        if needs_residuals(self.models) and self.distance != LIKELIHOOD:
-            raise UsageError(f"btr: least squares minimises a likelihood; give --distance {LIKELIHOOD}, or cmaes or ga")
-        get_choice(self.choice)
-        if self.distance != FITNESS:
-            get_distance(self.distance)
-
-
-@dataclass(frozen=True, eq=False)
-class Iteration:
-    """One round of the loop.
-
-    Attributes
-    ----------
-    number : from 1.
-    controller, expected : the fittest of Step 1, (p,), and its fitness in the model.
-    expected_mean : mean fitness of the last generation.
-    tried : on the robot.
-    transfer : mean absolute difference of expected and real fitness of these, before the model was corrected.
-    names : of the model's parameters, which `close` may add to.
-    model : (q,) the model after Step 3.
-    loss, loss_before, loss_mean : distance of this model, of the last one, and mean of the last generation, to the
-        trials that Step 3 explains.
-    population, losses : all models that Step 3 looked at, (k, q) and (k,).
-    population_names : of their parameters, before `close` added to them.
-    delta : mean absolute difference of fitness between this model and the robot on the trials of this iteration.
-    noise : position error of this model in noise floors on them; NaN where nothing was logged.
-    best : largest real fitness so far.
-    joined : what `close` said, if it ran.
-    """
-
-    number: int
-    controller: FloatArray
-    expected: float
-    expected_mean: float
-    tried: tuple[Tried, ...]
-    transfer: float
-    names: tuple[str, ...]
-    model: FloatArray
-    loss: float
-    loss_before: float
-    loss_mean: float
-    population: FloatArray
-    losses: FloatArray
-    delta: float
-    noise: float
-    best: float
-    joined: str = ""
-    population_names: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class BackToReality:
-    """What the loop ended with.
-
-    Attributes
-    ----------
-    stage, model : the best model: what runs it, and its numbers (q,).
-    iterations : all rounds.
-    best : the fittest controller on the robot.
-    reason : why it ended, a sentence.
-    finished : whether it ended because the requirement was met or the iterations done.
-    settings, seed : as given.
-    simulations : of whole trials, in Steps 1 and 3 and where effects were looked for.
-    seconds : wall time of this run.
-    """
-
-    stage: Stage
-    model: FloatArray
-    iterations: tuple[Iteration, ...]
-    best: Tried
-    reason: str
-    finished: bool
-    settings: Settings
-    seed: int
-    simulations: int
-    seconds: float
-
-    def _repr_html_(self) -> str:
-        from sysid_btr.btr.result import btr_result
-        from sysid_btr.display.html import result_html
-
-        return result_html(btr_result(self))
-
-    @property
-    def tried(self) -> tuple[Tried, ...]:
-        """All trials, in order."""
-        return tuple(t for i in self.iterations for t in i.tried)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Of the best model."""
-        return self.stage.parameters
 
 
 def back_to_reality(

@@ -27,8 +27,8 @@ from sysid_btr.run_folder import OVERLAY, RESULT, Folder, open_folder
 
 if TYPE_CHECKING:
     from sysid_btr.btr.controllers import ControllerSpace
-    from sysid_btr.btr.loop import Settings
     from sysid_btr.btr.robot import Robot
+    from sysid_btr.btr.settings import Settings
     from sysid_btr.btr.task import Walk
     from sysid_btr.estimators.base import Estimator
     from sysid_btr.models.robot import Robot as Model
@@ -113,7 +113,6 @@ def btr(options: BtrOptions) -> int:
     """
     from sysid_btr.btr.controllers import get_space
     from sysid_btr.btr.loop import back_to_reality
-    from sysid_btr.btr.result import btr_result
     from sysid_btr.btr.task import Walk
     from sysid_btr.result import exit_code
     from sysid_btr.terms.grammar import parse_parameters
@@ -150,7 +149,7 @@ def btr(options: BtrOptions) -> int:
             where = "nothing is kept without --out" if folder is None else f"what is done is kept in {folder.path}"
             more = "" if folder is None else ": the same command with --resume goes on from there"
             raise InterruptedRun(f"interrupted; {where}{more}") from None
-    result = btr_result(outcome, wall_s=perf_counter() - began)
+    result = outcome.to_dict(wall_s=perf_counter() - began)
     if folder is not None:
         _write(folder, result)
     print_result(result, options.json)
@@ -159,7 +158,8 @@ def btr(options: BtrOptions) -> int:
 
 def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
     """How the loop searches."""
-    from sysid_btr.btr.loop import (
+    from sysid_btr.btr.map_problem import model_fit
+    from sysid_btr.btr.settings import (
         LIKELIHOOD,
         Settings,
         cma_controller_searches,
@@ -167,7 +167,6 @@ def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
         model_search,
         papers_model_search,
     )
-    from sysid_btr.btr.map_problem import model_fit
 
     models: dict[str, Estimator] = {"cmaes": model_search(), "ga": papers_model_search(), "lsq": model_fit()}
     by_distance = "lsq" if options.distance == LIKELIHOOD else "cmaes"

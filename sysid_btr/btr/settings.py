@@ -1,0 +1,96 @@
+"""What the loop may spend, and how it searches and decides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from sysid_btr.btr.choice import get_choice
+from sysid_btr.btr.problems import FITNESS
+from sysid_btr.errors import UsageError
+from sysid_btr.estimators.base import Estimator
+from sysid_btr.estimators.chain import needs_residuals
+from sysid_btr.estimators.cma_es import CmaEs
+from sysid_btr.estimators.ga import GeneticAlgorithm
+from sysid_btr.objectives.distance import get_distance
+
+LIKELIHOOD = "likelihood"
+"""The distance by which Step 3 explains the first seconds of trials, and is biased by the last model."""
+FLIPS, BITS = 4.3, 8
+"""Bits by which a controller's children differ from it on average, and bits of each of its numbers."""
+
+
+def controller_search(numbers: int = 36) -> GeneticAlgorithm:
+    """Step 1 as in the paper's Fig. 3: 11 generations of 20, by a few mutations of the last controller.
+
+    Parameters
+    ----------
+    numbers : of a controller.
+    """
+    mutation = min(max(round(FLIPS / (BITS * numbers), 3), 0.001), 0.5)
+    return GeneticAlgorithm(population=20, generations=11, bits=BITS, mutation=mutation)
+
+
+def first_controller_search() -> GeneticAlgorithm:
+    """Step 1 of the first iteration: far from the controller known beforehand, which may not move at all."""
+    return GeneticAlgorithm(population=20, generations=11, bits=BITS)
+
+
+def cma_controller_searches(generations: int = 11) -> tuple[CmaEs, CmaEs]:
+    """Step 1 by CMA-ES, in the first iteration and in the others: as many controllers, found by other steps."""
+    far = CmaEs(sigma=0.3, population=20, max_generations=generations)
+    return far, replace(far, sigma=0.1)
+
+
+def model_search() -> CmaEs:
+    """Step 3 with as many models as in the paper's Fig. 3, 11 generations of 15, but told apart more finely."""
+    return CmaEs(population=15, max_generations=11, sigma=0.15)
+
+
+def papers_model_search() -> GeneticAlgorithm:
+    """Step 3 as in the paper's Fig. 3: 11 generations of 15."""
+    return GeneticAlgorithm(population=15, generations=11, bits=10)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the loop may spend and how it decides.
+
+    Attributes
+    ----------
+    iterations : at most.
+    trials : controllers tried in each (m in the paper); with a distance of sensors one or two will do.
+    first, controllers : Step 1 in the first iteration and in the others.
+    models : Step 3; least squares needs a likelihood.
+    distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse`` or ``wasserstein`` of whole trials, or the
+        ``likelihood`` of their first seconds, biased by the last model.
+    choice : of trials, ``fittest`` or ``disagreement``.
+    memory : trials that Step 3 explains, the newest first; those before are taken evenly.
+    rivals : candidate models that may disagree.
+    requirement : real fitness with which the work is done.
+    close : look for missing effects where Step 3 cannot explain the robot's logs.
+    correct : leave the model as it is and correct its fitness linearly instead (a baseline).
+    """
+
+    iterations: int = 13
+    trials: int = 12
+    first: Estimator = field(default_factory=first_controller_search)
+    controllers: Estimator = field(default_factory=controller_search)
+    models: Estimator = field(default_factory=model_search)
+    distance: str = FITNESS
+    choice: str = "fittest"
+    memory: int = 12
+    rivals: int = 5
+    requirement: float | None = None
+    close: bool = False
+    correct: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.iterations, self.trials, self.memory, self.rivals) < 1:
+            raise UsageError("btr: iterations, trials, memory and rivals must be at least 1")
+        if self.close and self.correct:
+            raise UsageError("btr: with a linear correction the model stays as it is; nothing can be added to it")
+        if needs_residuals(self.models) and self.distance != LIKELIHOOD:
+            raise UsageError(f"btr: least squares minimises a likelihood; give --distance {LIKELIHOOD}, or cmaes or ga")
+        get_choice(self.choice)
+        if self.distance != FITNESS:
+            get_distance(self.distance)
