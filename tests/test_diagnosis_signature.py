@@ -256,7 +256,7 @@ def test_a_single_push_is_localised_and_depends_on_nothing() -> None:
     assert knee["localised"]["share"] > 0.9
     assert 2.0 <= knee["localised"]["start"] <= 3.2
     assert knee["best"] == "none"
-    assert "no state" in found["summary"]
+    assert "independent of" in found["summary"]
 
 
 def test_pulses_are_described_by_period_and_amplitude() -> None:

@@ -235,7 +235,7 @@ def test_a_mass_that_nothing_responds_to_is_held_at_nominal() -> None:
     hip = by_name(clean_fit(), "mass:HipRoll")
     assert hip.identifiable == "no"
     assert hip.value == hip.nominal == 1.0
-    assert "held at its nominal value" in hip.reason
+    assert "fixed at its nominal value" in hip.reason
     assert hip.ci95 == hip.bounds
 
 

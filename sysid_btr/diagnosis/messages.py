@@ -65,15 +65,16 @@ def message_of(
     if verdict == "nothing_missing":
         return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
     if verdict == "unexplained":
-        hint = "" if not left else f" What is left is {left.get('summary', 'not characterised')}."
+        hint = "" if not left else f" The residual is {left.get('summary', 'not characterised')}."
         if effects:
             listing = ", ".join(f"{e.effect} at {_places(e.where)}" for e in effects)
-            hint = f" The nearest, {listing}, leaves {_left(before, after, channel)} (squared): it is not named.{hint}"
+            rest = _left(before, after, channel)
+            hint = f" The nearest, {listing}, leaves {rest} (squared), too much to be named.{hint}"
         return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
     if left:
-        errors += f" Something is left that no effect accounts for: {left.get('summary', 'not characterised')}."
+        errors += f" A residual remains that no effect accounts for: {left.get('summary', 'not characterised')}."
     listing = "; ".join(e.sentence for e in effects)
     if verdict == "ambiguous":
         other = ", ".join(dict.fromkeys(c for e in effects for c in e.confused_with))
-        return f"Ambiguous: the model lacks {listing}; this log cannot tell it from {other}." + errors
+        return f"Ambiguous: the model lacks {listing}; on this log it is confounded with {other}." + errors
     return f"The model lacks {listing}." + errors

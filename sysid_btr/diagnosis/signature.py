@@ -250,7 +250,7 @@ def signature(study: Study, model: Model) -> dict[str, Any]:
     """
     torques = missing_torques(study.train_problem(model), model.values, study.scales)
     if not torques:
-        why = "its base was free, and windows are too short" if study.free else "the replay fails or is too short"
+        why = "its base was floating, and segments are too short" if study.free else "the replay fails or is too short"
         return {"summary": f"not characterised: {why}", "joints": []}
     loud = sorted((t for t in torques if t.chi2 >= LOUD), key=lambda t: -_blame(t))
     if not loud:
@@ -378,7 +378,7 @@ def _features(
     yield _Feature("command_rate", "the rate of the command", of(np.gradient(one.command, one.period), 7))
     patch = hats(q, np.linspace(q.min(), q.max(), 14))
     yield _Feature(
-        "position_and_direction", "the position, against the motion", sign[:, None] * patch
+        "position_and_direction", "the position and the direction of motion", sign[:, None] * patch
     )
     for other in torques:
         if other.episode == one.episode and other.joint != one.joint:
@@ -388,18 +388,18 @@ def _features(
         phase = np.mod((one.time - periodic["start"]) / periodic["period"] + 0.25, 1.0)
         count = int(np.clip(2 * periodic["period"] / max(periodic["duration"], one.period), 10, 40))
         beat = hats(phase, np.linspace(0, 1, count))
-        again = f"the time within a period of {periodic['period']:.3g} s"
+        again = f"the phase of a period of {periodic['period']:.3g} s"
         yield _Feature("phase", again, beat, True)
         yield _Feature("torque_and_phase", f"the servo's torque and {again}", beat * one.servo_measured[:, None], True)
     knots = np.linspace(one.time[0], one.time[-1], int(np.clip((one.time[-1] - one.time[0]) / 1.5, 3, 25)))
     slow = hats(one.time, knots)
-    yield _Feature("time", "time alone, slowly", slow, True)
-    yield _Feature("torque_and_time", "the servo's torque, by a gain that drifts", slow * load[:, None], True)
+    yield _Feature("time", "time alone, a slow drift", slow, True)
+    yield _Feature("torque_and_time", "the servo's torque, with a gain that drifts", slow * load[:, None], True)
     # the frequency is chosen on all data: it has to beat time as well
     for line in spatial_lines(one)[:1]:
         pair = np.column_stack([np.sin(line.number * q), np.cos(line.number * q)])
         length = f"{2 * np.pi / line.number:.3g} {'m' if one.unit == 'N' else 'rad'}"
-        yield _Feature("fine_position", f"the position, again every {length}", pair)
+        yield _Feature("fine_position", f"the position, repeating every {length}", pair)
 
 
 def _gain_rhythm(one: MissingTorque) -> float | None:
@@ -429,14 +429,14 @@ def _words(
         text = text.replace("torque", "force")
     beats = feature is not None and feature.name.endswith("phase")
     if localised["share"] > MOSTLY and not beats:
-        text += f", {100 * localised['share']:.0f} % of its trace in the second after t = {localised['start']:.3g} s"
+        text += f", {100 * localised['share']:.0f} % of its power in the second after t = {localised['start']:.3g} s"
     elif periodic is not None and (feature is None or beats):
-        kind = "" if periodic["same_sign"] else " of either sign"
+        kind = "" if periodic["same_sign"] else " of both signs"
         text += (
             f", in pulses{kind} of {periodic['amplitude']:.2g} {one.unit} and {periodic['duration']:.2g} s"
             f" every {periodic['period']:.4g} s (one at {periodic['start']:.3g} s)"
         )
     if feature is None:
-        return text + ", which no state of the robot predicts"
+        return text + ", independent of the robot's state"
     text += f", a function of {feature.words}"
     return text if drift is None else text + f" with a period of {drift:.2g} s"

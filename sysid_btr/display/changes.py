@@ -86,7 +86,7 @@ def model_lines(result: Mapping[str, Any]) -> Iterator[str]:
         word = "not in it" if part["held"] == "no" else "not quite in it"
         yield f"  {word}: {part['text']}: {part['how']}{_cost(part, written)}"
     if written["not_told"]:
-        yield f"  left at nominal, as this log cannot tell them: {', '.join(written['not_told'])}"
+        yield f"  left at nominal, not identifiable from this log: {', '.join(written['not_told'])}"
 
 
 def fidelity(written: Mapping[str, Any]) -> str:

@@ -60,7 +60,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     for effect in result.get("effects", []):
         yield Text(f"+ {effect['sentence'] or effect['effect']}")
         if effect["confused_with"]:
-            yield Text(f"  this log cannot tell it from: {', '.join(effect['confused_with'])}")
+            yield Text(f"  confounded on this log with: {', '.join(effect['confused_with'])}")
     estimates = [
         *result.get("parameters", []),
         *(p for e in result.get("effects", []) for p in e["parameters"]),
@@ -74,7 +74,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     if result.get("verdict") in ("ambiguous", "unexplained") and result.get("candidates"):
         yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
     if result.get("signature"):
-        yield Text("what is left: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
+        yield Text("residual: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
     for p in result.get("profiles", []):
         ends = zip(p["ci95"], p["closed"], strict=True)
         low, high = (number(end) + ("" if closed else " (not closed)") for end, closed in ends)
@@ -93,8 +93,8 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 
 def walk_words(walk: Mapping[str, Any]) -> Iterator[str]:
-    """What was done with a log of a free base."""
-    yield f"free base: {walk['windows']} windows of {walk['window']:.2g} s fitted, each from a reconstructed state"
+    """What was done with a floating-base log."""
+    yield f"floating base: {walk['windows']} segments of {walk['window']:.2g} s fitted, each from an estimated state"
     if walk["counted_less"]:
         yield f"{walk['counted_less']} of them, mostly impacts, count less"
     yield from walk["events"]
@@ -141,7 +141,7 @@ def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
     table = _table("parameter")
     for name in ("nominal", "value", "std", "95 % interval", "unit"):
         table.add_column(name, justify="left" if name == "unit" else "right", no_wrap=True)
-    table.add_column("told by this log")
+    table.add_column("identifiable")
     for p in parameters:
         known = p["identifiable"] != "no"
         table.add_row(
@@ -157,9 +157,9 @@ def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def candidates_table(candidates: Sequence[Mapping[str, Any]]) -> Table:
-    """Effects that were weighed."""
-    table = _table("weighed effect")
-    for name in ("where", "would explain", "size", "hard to tell from"):
+    """Effects that were considered."""
+    table = _table("effect considered")
+    for name in ("where", "would explain", "size", "confounded with"):
         table.add_column(name)
     for c in candidates:
         explained = "-" if c["explained"] is None else f"{100 * c['explained']:.0f} %"
@@ -189,7 +189,7 @@ def joints_table(joints: Mapping[str, float], unit: str) -> Table:
 
 
 def told(parameter: Mapping[str, Any]) -> str:
-    """Whether a log tells a parameter, in words."""
+    """Whether a parameter is identifiable, in words."""
     words = {"yes": "yes", "weak": "weakly", "no": "not identifiable"}[parameter["identifiable"]]
     return f"{words}, at its bound" if parameter["at_bound"] and parameter["identifiable"] != "no" else words
 

@@ -119,17 +119,17 @@ def message(design: Design) -> str:
     """The outcome in one sentence."""
     count = sum(e.identifiable != "no" for e in design.designed.estimates)
     parts = [
-        f"{count} of {len(design.designed.estimates)} parameters can be told after this motion of "
+        f"{count} of {len(design.designed.estimates)} parameters are identifiable from this motion of "
         f"{design.family.clock.seconds:g} s",
     ]
     if any(design.told):
         parts.append(
-            f"in the mean their intervals are {design.mean_ratio:.2f} of those after {design.compared_with} "
+            f"on average their intervals are {design.mean_ratio:.2f} of those after {design.compared_with} "
             f"({design.reference.seconds:.3g} s)"
         )
     if design.beyond:
         worst = max(design.beyond, key=lambda joint: design.beyond[joint])
-        parts.append(f"in the model {worst} leaves its range by {design.beyond[worst]:.2g}")
+        parts.append(f"in the model {worst} exceeds its range by {design.beyond[worst]:.2g}")
     return "; ".join(parts) + "."
 
 
@@ -147,7 +147,7 @@ def show(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     for name in ("nominal", f"std, {result['reference']['motion']}", "std, designed", "95 % interval +-", "ratio"):
         table.add_column(name, justify="right")
     table.add_column("unit")
-    table.add_column("told")
+    table.add_column("identifiable")
     for p in result["parameters"]:
         known, before = p["identifiable"] != "no", p["reference"]
         table.add_row(
@@ -198,7 +198,7 @@ def plot_motion(design: Design) -> Figure:
     ratios = np.where(design.told, design.ratios, np.nan)
     axis.barh(place, ratios, color=[FOUND if r <= 1 else PLAIN for r in np.nan_to_num(ratios)])
     for y, ratio in zip(place, ratios, strict=True):
-        text = f" {ratio:.2f}" if np.isfinite(ratio) else " told by neither"
+        text = f" {ratio:.2f}" if np.isfinite(ratio) else " not identifiable from either"
         axis.text(ratio if np.isfinite(ratio) else 0.0, y, text, va="center", fontsize=8, color=ink())
     axis.axvline(1.0, color=faint(), lw=0.8)
     axis.set_yticks(place, names, fontsize=8)

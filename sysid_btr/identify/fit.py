@@ -75,14 +75,14 @@ class Fit:
     def message(self) -> str:
         """The outcome in one sentence."""
         told = sum(e.identifiable != "no" for e in self.estimates)
-        parts = [f"{told} of {len(self.estimates)} parameters can be told from this log"]
+        parts = [f"{told} of {len(self.estimates)} parameters are identifiable from this log"]
         if "position" in self.before.holdout:
             nominal, before = self.nominal.holdout["position"], self.before.holdout["position"]
             unit = channel_units(self.study.robot)["position"].partition(",")[0]
             first, last, floor = si_all([nominal.rmse, before.rmse, before.floor], unit)
             parts.append(
                 f"the held-out position error goes from {first} to {last}, "
-                f"where the sensor's own noise is {floor}"
+                f"with a noise floor of {floor}"
             )
         if not self.result.converged:
             parts.append("the fit did not converge")

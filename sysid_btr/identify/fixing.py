@@ -30,11 +30,11 @@ def fix_unidentifiable(
 ) -> tuple[FloatArray, tuple[Estimate, ...], int]:
     """Fix what is not identifiable at its nominal value, and refit the rest: values, estimates, evaluations.
 
-    Of parameters that are identifiable only together, as few are fixed as it takes to identify the others: to fix them
-    all would contradict what is known of them together. The intervals stay those of the joint fit, about its own
-    estimates, so they still cover whatever value the fixed parameters really have. Nothing is fixed where that predicts
-    the log worse: the intervals are those of a linear model, and of the model's own error where there is one. Where
-    more is known of the parameters than the residuals tell, that says what the others are beside those that are fixed.
+    Of parameters that are identifiable only in combination, as few are fixed as it takes to identify the others: to fix
+    them all would contradict what is known of their combination. The intervals stay those of the joint fit, about its
+    own estimates, so they still cover whatever value the fixed parameters really have. Nothing is fixed where that
+    predicts the log worse: the intervals are those of a linear model, and of the model's own error where there is one.
+    Where more is known of the parameters than the residuals contain, the others are conditioned on the fixed ones.
     """
     if known is not None:
         blind = np.array([e.identifiable == "no" for e in found])
@@ -68,7 +68,7 @@ def _fixed(values: FloatArray, found: tuple[Estimate, ...], blind: BoolArray) ->
     moved = []
     for estimate, value, fixed in zip(found, values, blind, strict=True):
         low, high = estimate.bounds if estimate.identifiable == "no" else estimate.ci95
-        reason = f"{estimate.reason}; held at its nominal value" if fixed else estimate.reason
+        reason = f"{estimate.reason}; fixed at its nominal value" if fixed else estimate.reason
         span = estimate.bounds[1] - estimate.bounds[0]
         at_bound = bool(min(value - estimate.bounds[0], estimate.bounds[1] - value) <= 1e-6 * span)
         ci95 = (min(low, float(value)), max(high, float(value)))

@@ -152,7 +152,7 @@ def tell(
     cov: FloatArray,
     span: float,
 ) -> tuple[Identifiable, str]:
-    """Whether a log tells parameter `i`, and if not, why.
+    """Whether parameter `i` is identifiable, and if not, why.
 
     Parameters
     ----------
@@ -178,7 +178,6 @@ def tell(
     partner = int(np.argmax(np.abs(correlation)))
     sign = "difference" if correlation[partner] > 0 else "sum"
     return state, (
-        f"this log tells it only together with {parameters[partner].name} "
-        f"(correlation {correlation[partner]:+.2f}); their weighted "
-        f"{'sum' if sign == 'difference' else 'difference'} is not told, their {sign} is"
+        f"confounded on this log with {parameters[partner].name} (correlation {correlation[partner]:+.2f}); their "
+        f"weighted {sign} is identifiable, their {'sum' if sign == 'difference' else 'difference'} is not"
     )

@@ -17,7 +17,7 @@ from sysid_btr.result import SCHEMA, clean, versions
 from sysid_btr.units import si_all
 
 COUNTED_LESS = 0.9
-"""Weight below which a window of a walk counts as one that the model does not explain."""
+"""Weight below which a segment of a floating-base log counts as one that the model does not explain."""
 
 
 def study_result(
@@ -53,7 +53,7 @@ def replay_result(
     if position is not None and math.isfinite(position.rmse):
         unit = channel_units(study.robot)["position"].partition(",")[0]
         error, floor = si_all([position.rmse, position.floor], unit)
-        message = f"position error {error}, where the sensor's own noise is {floor}."
+        message = f"position error {error}, with a noise floor of {floor}."
     found = {
         "kind": "replay",
         "message": message,
@@ -84,7 +84,7 @@ def _provenance(study: Study) -> dict[str, Any]:
 
 
 def _walks(study: Study) -> list[dict[str, Any]]:
-    """How each log of a free base was cut up, and what its base state lacks."""
+    """How each floating-base log was segmented, and what its base state lacks."""
     return [
         {
             "path": None if log.path is None else str(log.path),

@@ -82,7 +82,7 @@ class Posterior:
         told = sum(e.identifiable != "no" for e in self.estimates)
         found = self.sample.convergence
         parts = [
-            f"{told} of {len(self.estimates)} parameters can be told from this log",
+            f"{told} of {len(self.estimates)} parameters are identifiable from this log",
             f"{float(np.min(found.ess)):.0f} effective draws or more, R-hat {float(np.max(found.rhat)):.3f} or less",
             *(
                 f"{100 * share:.1f} % of held-out {channel} lie in the 95 % bands"
@@ -94,7 +94,7 @@ class Posterior:
             start = " ".join(f"--start '{n}={v:.6g}'" for n, v in zip(self.sample.names, best, strict=True))
             parts.append(
                 f"a draw is more likely than the fit by exp({self.sample.gain:.1f}), so the fit had missed the "
-                f"minimum: begin again with {start}"
+                f"minimum: start again with {start}"
             )
         if not self.converged:
             parts.append("the posterior did not converge")

@@ -23,7 +23,7 @@ TEMPLATE = Path(__file__).with_name("report.html.j2")
 VERDICTS = {
     "explained": "The log shows effects that the model lacks, and they are named below.",
     "nothing_missing": "With these parameters the model explains the log down to the noise of its sensors.",
-    "ambiguous": "Something is missing, and this log cannot tell which of several effects it is.",
+    "ambiguous": "Something is missing, and on this log several effects that would explain it are confounded.",
     "unexplained": "Something is missing that no effect of the library explains.",
 }
 
@@ -77,13 +77,13 @@ def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
 
 def _intervals(result: Mapping[str, Any]) -> str:
     """What the intervals of a result are, in a sentence."""
-    limit = "they do not cover a model that is wrong in a way nobody named."
+    limit = "they do not cover a model error that nobody named."
     return {
         "btr": f"Intervals are of the {result.get('intervals', '')}; {limit}",
         "posterior": "Value: posterior mean; interval: the central 95 % of the draws. The likelihood counts correlated "
         f"residuals and the replay's own numerical error; {limit}",
-        "excite": "What a fit of a log of this motion to this model is expected to give (the Cramer-Rao bound), beside "
-        "the same of the motion it is compared with.",
+        "excite": "Expected of a fit to a log of this motion (the Cramer-Rao bound), compared with the same for the "
+        "reference motion.",
     }.get(
         result["kind"],
         f"Intervals hold for correlated residuals and for the replay's own numerical error; {limit}",

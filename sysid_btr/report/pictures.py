@@ -48,43 +48,43 @@ class Caption:
 CAPTIONS: Mapping[str, Caption] = {
     "overlay": Caption(
         "Command, log and model where the model was most wrong",
-        "Left the whole log, the part held out shaded; in the middle the seconds in which the plain model is farthest "
-        "off; right what is left of the error there, over twice the sensor's noise.",
+        "Left: the whole log, the held-out part shaded. Middle: the seconds in which the plain model is farthest off. "
+        "Right: the residual there, over twice the sensor's noise.",
     ),
     "render": Caption(
         "Log, model before and model after, side by side",
-        "The log's pose shows through in red where a model is elsewhere; render.gif in the folder moves.",
+        "Red: the log's pose where a model deviates from it. render.gif in the folder is animated.",
     ),
     "residuals": Caption(
-        "Does what is left follow from something?",
-        "Correlation of the held-out residual with itself (left) and with what was commanded before (right). Inside "
-        "the band it is as in white noise. A curve that leaves the band on the right is motion the model lacks.",
+        "Is the residual correlated with anything?",
+        "Correlation of the held-out residual with itself (left) and with earlier commands (right). Inside the band "
+        "it is that of white noise. A curve that leaves the band on the right is motion that the model lacks.",
     ),
-    "convergence": Caption("How the search went"),
+    "convergence": Caption("Progress of the search"),
     "predictive": Caption(
-        "What the posterior predicts of held-out data",
-        "Left the seconds in which the data surprise most, right the error over the whole held-out part; 95 % of the "
+        "Posterior prediction of held-out data",
+        "Left: the seconds that are predicted worst. Right: the error over the whole held-out part. 95 % of the "
         "samples should lie in the band.",
     ),
     "corner": Caption(
         "The posterior",
-        "Every parameter, and every two of them; a slanted ellipse is a combination that the log tells worse than its "
-        "parts. Red lines: the least-squares fit. Dashed: median and 95 % interval.",
+        "Every parameter, and every two of them; a slanted ellipse means that the two are correlated. "
+        "Red lines: the least-squares fit. Dashed: median and 95 % interval.",
     ),
     "trace": Caption(
         "Did the draws converge?",
-        "Mean and central 95 % of the walkers of each independent ensemble, step by step: they should lie on each "
-        "other and have no trend.",
+        "Mean and central 95 % of the walkers of each independent ensemble, step by step: they should "
+        "coincide and show no trend.",
     ),
     "profile": Caption(
         "Profile of the likelihood",
-        "Deviance while the parameter is held and all others are fitted anew; the interval ends where it crosses the "
-        "line. Where it follows the dashed parabola, the standard error says it all.",
+        "Deviance with the parameter fixed and all others fitted anew; the interval ends where it crosses the line. "
+        "Where it follows the dashed parabola, the standard error is sufficient.",
     ),
     "excite": Caption(
-        "The motion, and what it tells",
-        "Left the commands of the joints that move most, within their bounds; right the standard error that a fit of "
-        "this motion will have, over that of the motion it is compared with: shorter is better.",
+        "The motion, and how informative it is",
+        "Left: the commands of the joints that move most, within their bounds. Right: the expected standard errors, "
+        "relative to those of the reference motion: shorter is better.",
     ),
     "btr": Caption(
         "Fitness, its difference between model and robot, and the model, over the iterations",
