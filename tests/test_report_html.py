@@ -106,7 +106,7 @@ def test_the_report_of_a_fit_shows_its_search_and_profiles(folders: Path) -> Non
 
 def test_the_report_of_a_motion_says_what_to_do_with_it(folders: Path) -> None:
     text = (folders / "excite" / "report.html").read_text()
-    for part in ("Excitation trajectory", "excite.parquet", "hitting the robot itself", "Cramer-Rao", "<th>identifiable"):
+    for part in ("Excitation trajectory", "excite.parquet", "hitting the robot itself", "Cramer-Rao", "identifiable<"):
         assert part in text
 
 
