@@ -42,7 +42,7 @@ def later_split(study: Study, fitted: Fitted, rules: Selection) -> Study | None:
     for i, log in enumerate(study.holdout):
         time = log.time - log.time[0]
         count = int(time[-1] / BLOCK) + 1
-        cut = _cut(np.maximum(by_block[first : first + count], 0.0), split[i], float(time[-1]), rules)
+        cut = cut_time(np.maximum(by_block[first : first + count], 0.0), split[i], float(time[-1]), rules)
         first += count
         if cut > split[i]:
             size = int(np.searchsorted(time, cut))
@@ -52,7 +52,7 @@ def later_split(study: Study, fitted: Fitted, rules: Selection) -> Study | None:
     return replace(study, train=tuple(train), split=tuple(split))
 
 
-def _cut(excess: FloatArray, now: float, end: float, rules: Selection) -> float:
+def cut_time(excess: FloatArray, now: float, end: float, rules: Selection) -> float:
     """Time (s) that halves the excess, or that follows all of it where it is brief."""
     total = float(excess.sum())
     latest = end - rules.least_holdout * end
