@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.closing import Candidate
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
 from sysid_btr.diagnosis.scan import Question, Sensitivity
 from sysid_btr.diagnosis.selection import (
@@ -42,7 +43,7 @@ from sysid_btr.diagnosis.trials import (
     is_rival,
     is_superfluous,
 )
-from sysid_btr.diagnosis.verdict import verdict_of
+from sysid_btr.diagnosis.verdict import giving_way, verdict_of
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted, paired_t
 from sysid_btr.simulation.numerics import Numerics
@@ -638,6 +639,20 @@ def test_verdict(now: Fitted, rivals: Sequence[Sequence[str]], floating: bool, e
 
 def test_a_short_log_may_leave_more_by_chance() -> None:
     assert verdict_of(RULES, fitted([2.0], overall_chance=0.1), fitted([1.39]), (), floating=False) == "nothing_missing"
+
+
+@pytest.mark.parametrize(
+    ("candidate", "expected"),
+    [
+        (Candidate("command_delay", ("hip", "knee"), 0.9, 0.1, ("sensor_delay", "backlash")), ("sensor_delay",)),
+        (Candidate("command_delay", ("knee",), 0.9, 0.1, ("sensor_delay",)), ()),
+        (Candidate("backlash", ("hip", "knee"), 0.9, 0.1, ("sensor_delay",)), ()),
+    ],
+)
+def test_what_did_as_well_and_gives_way_by_convention_is_confused_with_what_is_named(
+    candidate: Candidate, expected: tuple[str, ...]
+) -> None:
+    assert giving_way(CommandDelay(("knee", "hip")), [candidate]) == expected
 
 
 # --- where an effect shows only in what was to be held out ------------------------------------------------------------

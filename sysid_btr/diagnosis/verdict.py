@@ -72,7 +72,7 @@ def _named(state: State) -> tuple[NamedEffect, ...]:
         without[columns] = effect.neutral
         off = judge(state.study, model.at(without))
         gain = (off.holdout - state.fitted.holdout) / max(off.holdout, 1e-12)
-        confused = (*confused, *(n for n in _giving_way(effect, state.candidates) if n not in confused))
+        confused = (*confused, *(n for n in giving_way(effect, state.candidates) if n not in confused))
         result.append(
             NamedEffect(
                 effect=effect.name,
@@ -87,7 +87,7 @@ def _named(state: State) -> tuple[NamedEffect, ...]:
     return tuple(result)
 
 
-def _giving_way(effect: Effect, candidates: Sequence[Candidate]) -> tuple[str, ...]:
+def giving_way(effect: Effect, candidates: Sequence[Candidate]) -> tuple[str, ...]:
     """Effects that did as well at the same locations but give way to this one, by convention."""
     own = next((c for c in candidates if c.effect == effect.name and set(c.where) == set(effect.places)), None)
     giving = {e.name for e in select_effects(("all",)) if effect.name in e.yields_to}
