@@ -37,7 +37,7 @@ from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.distance import Distance, DistanceProblem, MeanSquare, Phi1, Phi2, Wasserstein
-from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.result import to_json
 from sysid_btr.simulation.numerics import Numerics
@@ -138,7 +138,7 @@ class Hidden:
         episodes = []
         for log in logs:
             run = Replay(self.robot, log, self.free, NUMERICS, threads=1)
-            episodes.append(Episode(run, make_targets(log, run.index.joints, ("position",))))
+            episodes.append(Comparison(run, make_targets(log, run.index.joints, ("position",))))
         return ReplayProblem(tuple(episodes), np.ones(len(STARRED)))
 
 

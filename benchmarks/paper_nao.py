@@ -34,7 +34,7 @@ from sysid_btr.models.gait import Gait, gait
 from sysid_btr.models.nao import PAPER_BOUNDS, STARRED
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.distance import Distance, DistanceProblem, MeanSquare, Phi2
-from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.result import to_json
 from sysid_btr.simulation.numerics import Numerics
@@ -89,7 +89,7 @@ class Experiment:
         robot = replace(load_robot("nao"), bounds=PAPER_BOUNDS)
         terms = parse_parameters([f"mass:{','.join(STARRED)}"], robot)
         run = Replay(robot, self.log, terms, NUMERICS, threads=self.threads)
-        episode = Episode(run, make_targets(self.log, run.index.joints, ("position",)))
+        episode = Comparison(run, make_targets(self.log, run.index.joints, ("position",)))
         return ReplayProblem((episode,), np.ones(len(run.parameters)))
 
     @cached_property

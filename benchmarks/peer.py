@@ -248,7 +248,7 @@ def compare(case: Case, expressions: Sequence[str], *, threads: int, repeats: in
     ours = [name for name in runs if not name.startswith("peer")]
 
     return {
-        "seconds_fitted": round(float(study.train[0].time[-1] - study.train[0].time[0]), 2),
+        "seconds_fitted": round(float(study.train[0].log.time[-1] - study.train[0].log.time[0]), 2),
         "parameters": len(problem.parameters),
         "threads": threads,
         "numerics": str(case.numerics),

@@ -22,7 +22,7 @@ from typing import Any
 
 from benchmarks.gantry import data_folder
 from sysid_btr.diagnosis.close import close
-from sysid_btr.floating_base.walk import make_walk
+from sysid_btr.floating_base.episode import reconstruct
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
@@ -152,11 +152,10 @@ def close_b(folders: Folders) -> dict[str, Any]:
 def fall(folders: Folders) -> dict[str, Any]:
     """The fall of walk_fall, and how much of the log before it is used."""
     robot = load_robot(str(folders.data / "nao_walk/nominal_free.xml"))
-    walk = make_walk(robot, read_log(folders.data / "nao_walk/walk_fall.parquet"))
-    assert walk.base is not None
-    moments = [e.start for e in walk.base.events if e.kind == "fall"]
+    log, base = reconstruct(robot, read_log(folders.data / "nao_walk/walk_fall.parquet"))
+    moments = [e.start for e in base.events if e.kind == "fall"]
     found = moments[0] if moments else None
-    used = float(walk.time[-1] - walk.time[0])
+    used = float(log.time[-1] - log.time[0])
     missed = []
     if found is None or abs(found - FALL) > FALL_ERROR:
         missed.append(f"fall found at {found} s, not {FALL}")

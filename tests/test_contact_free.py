@@ -12,7 +12,7 @@ from walks import record_walk
 from benchmarks import ground
 from sysid_btr.floating_base import contact_free
 from sysid_btr.floating_base.contact_free import difference, without_ground
-from sysid_btr.identify.fusion import weigh_walks
+from sysid_btr.floating_base.segments import FloatingReplay
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
@@ -20,7 +20,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
+from sysid_btr.simulation.segments import BASE, Windows
 
 MASSES = ["mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"]
 
@@ -158,7 +158,8 @@ def test_masses_come_out_whatever_the_ground_is(on_springs: tuple[ground.Walker,
     rows = np.arange(60)
     jacobian = np.zeros((problem.count, len(begin)))
     jacobian[rows, rows % len(begin)] = 3.0
-    weighed = weigh_walks(study, problem, begin, jacobian, np.zeros(problem.count))
+    weighed = study.fuse(problem, begin, jacobian, np.zeros(problem.count))
+    assert weighed is not None
     assert weighed.known is not None
     told = estimates(
         problem.parameters,
@@ -184,7 +185,7 @@ def test_logs_that_do_not_suit_are_left_alone(on_springs: tuple[ground.Walker, L
     _, log = on_springs
     problem, _ = problem_of(make_study(load_robot("nao"), [log]))
     replay = problem.episodes[0].replay
-    assert isinstance(replay, WindowReplay)
+    assert isinstance(replay, FloatingReplay)
     assert contact_free._suits(replay)
     time = replay.log.time.copy()
     time[1::2] += 0.003

@@ -315,9 +315,9 @@ def test_an_effect_that_only_the_held_out_part_shows_is_found_by_fitting_more_of
     effect = only_effect(found)
     assert effect.effect in ("torque_limit", "speed_torque_limit"), found.message
     assert effect.where == KNEE
-    assert found.study.split[0] > 11.5
-    assert found.study.split[0] <= 0.9 * 16.0
-    assert len(found.study.train[0]) < len(found.study.holdout[0])
+    assert found.study.holdout[0].begin > 11.5
+    assert found.study.holdout[0].begin <= 0.9 * 16.0
+    assert len(found.study.train[0].log) < len(found.study.holdout[0].log)
 
 
 def test_a_late_sensor_is_told_from_a_late_command_by_the_joints_that_it_does_not_move() -> None:

@@ -29,7 +29,7 @@ from sysid_btr.io.validation import validate_file
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import joint_names
 from sysid_btr.objectives.noise import NoiseFloor
-from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 LEG, CLEAN = SAMPLES / "leg.xml", SAMPLES / "leg_clean.parquet"
@@ -156,7 +156,7 @@ def noisy(problem: ReplayProblem, truth: np.ndarray, rng: np.random.Generator) -
         replace(t, measured=(clean := t.predicted(outputs)[0]) + t.sigma * rng.standard_normal(clean.shape))
         for t in episode.targets
     )
-    return ReplayProblem((Episode(episode.replay, targets),), problem.start)
+    return ReplayProblem((Comparison(episode.replay, targets),), problem.start)
 
 
 def test_predicted_errors_are_those_of_fits() -> None:

@@ -26,7 +26,7 @@ from sysid_btr.objectives.distance import (
     phi1,
 )
 from sysid_btr.objectives.noise import NoiseFloor
-from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.grammar import parse_parameters
@@ -140,7 +140,7 @@ def test_the_true_gain_is_nearest(name: str) -> None:
     truth = position(robot, log, terms, [0.9])
     recorded = replace(log, channels={**log.channels, "position.arm": truth[:, 0]})
     replay = Replay(robot, recorded, terms, FINE)
-    episode = Episode(replay, make_targets(recorded, replay.index.joints, ("position",)))
+    episode = Comparison(replay, make_targets(recorded, replay.index.joints, ("position",)))
     distance = get_distance(name)
     assert distance is not None
     losses = DistanceProblem(ReplayProblem((episode,), np.array([1.0])), distance).loss(

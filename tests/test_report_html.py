@@ -214,7 +214,7 @@ def test_results_show_themselves_in_a_notebook(fitted: Fit) -> None:
         text = outcome._repr_html_()
         assert "mass:arm" in text
         assert "95 % interval" in text
-    assert "samples" in fitted.study.train[0]._repr_html_()
+    assert "samples" in fitted.study.train[0].log._repr_html_()
     assert "with a servo" in fitted.study.robot._repr_html_()
 
 

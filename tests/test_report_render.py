@@ -49,7 +49,7 @@ def needs_a_driver(fitted: Any) -> None:
 
 def test_moments_are_where_the_models_differ_most(fitted: Any) -> None:
     scene = scene_of(fitted)
-    held_out = scene.time >= fitted.study.split[0]
+    held_out = scene.time >= fitted.study.holdout[0].begin
     assert all(held_out[i] for i in scene.moments)
     assert list(scene.moments) == sorted(set(scene.moments))
     before, after = scene.apart["model before"], scene.apart["model after"]
@@ -59,7 +59,7 @@ def test_moments_are_where_the_models_differ_most(fitted: Any) -> None:
 
 
 def test_poses_are_those_of_log_and_replay(fitted: Any) -> None:
-    scene, log = scene_of(fitted), fitted.study.holdout[0]
+    scene, log = scene_of(fitted), fitted.study.holdout[0].log
     np.testing.assert_array_equal(scene.poses["log"][:, 0], log.channels["position.pendulum"])
     replay = fitted.study.holdout_problem(fitted.model).episodes[0].replay
     np.testing.assert_array_equal(
@@ -68,7 +68,7 @@ def test_poses_are_those_of_log_and_replay(fitted: Any) -> None:
 
 
 def test_missing_samples_are_bridged(fitted: Any) -> None:
-    log = fitted.study.holdout[0]
+    log = fitted.study.holdout[0].log
     holes = log.channels["position.pendulum"].copy()
     holes[100:120] = np.nan
     patched = replace(log, channels={**log.channels, "position.pendulum": holes})

@@ -15,18 +15,12 @@ from walks import Truth, plain_walk, record_walk
 from sysid_btr.errors import LogError
 from sysid_btr.estimators import Budget, Journal, silent
 from sysid_btr.estimators.lsq import LeastSquares, linearise
-from sysid_btr.floating_base import walk as walk_module
-from sysid_btr.floating_base.walk import (
-    Walk,
-    covered,
-    cut_up,
-    lay_windows,
-    make_walk,
-    of_legs,
-    repeated_error,
-    start_lanes,
-    stride,
-)
+from sysid_btr.floating_base import segments as segments_module
+from sysid_btr.floating_base.episode import FloatingEpisode, reconstruct
+from sysid_btr.floating_base.estimate import BaseState
+from sysid_btr.floating_base.initial_states import start_lanes
+from sysid_btr.floating_base.segments import covered, segment_best, segment_log, segment_seconds
+from sysid_btr.floating_base.strides import of_legs, repeated_error, stride
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.intervals import estimates
@@ -261,60 +255,62 @@ def test_an_uncertain_start_costs_information_and_never_invents_any() -> None:
 
 
 @cache
-def laid_walk() -> Walk:
-    return lay_windows(make_walk(load_robot("nao"), plain_walk()[0]), 0.2, (7.0,))
+def reconstructed() -> tuple[Log, BaseState]:
+    return reconstruct(load_robot("nao"), plain_walk()[0])
 
 
-def test_windows_tile_a_walk_and_do_not_cross_the_border_of_what_is_held_out() -> None:
-    walk = laid_walk()
-    assert walk.windows is not None
-    rows = walk.windows.rows
+def test_segments_tile_a_walk_and_do_not_cross_the_border_of_what_is_held_out() -> None:
+    log, base = reconstructed()
+    segments = segment_log(log, base, 0.2, (7.0,))
+    rows = segments.rows
     assert np.all(rows[:, 1] - rows[:, 0] == 10)
     assert np.all(rows[1:, 0] >= rows[:-1, 1])
-    assert not np.any((walk.time[rows[:, 0]] < 6.99) & (walk.time[rows[:, 1] - 1] > 7.0))
-    assert covered(walk).mean() > 0.95
+    assert not np.any((log.time[rows[:, 0]] < 6.99) & (log.time[rows[:, 1] - 1] > 7.0))
+    assert covered(segments, len(log)).mean() > 0.95
 
 
-def test_a_part_of_a_walk_keeps_the_windows_that_lie_in_it() -> None:
-    walk = laid_walk()
-    part = walk.window(100, 200)
-    assert isinstance(part, Walk)
-    assert part.windows is not None
-    assert walk.windows is not None
-    assert len(part.windows) == 10
-    assert part.windows.rows.min() == 0
-    assert part.windows.rows.max() == 100
-    k = int(np.flatnonzero(walk.windows.rows[:, 0] == 100)[0])
-    assert np.array_equal(part.windows.position[0], walk.windows.position[k])
-    assert part.base is not None
-    assert len(part.base.time) == 100
+def test_the_fitted_and_the_held_out_part_of_a_walk_have_the_segments_that_lie_in_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(segments_module, "LENGTHS", (0.2,))
+    monkeypatch.setattr(segments_module, "TRIED", 4)
+    fitted, held_out = FloatingEpisode.split(load_robot("nao"), plain_walk()[0], 0.3, threads=2)
+    assert len(fitted.log) < len(held_out.log) == len(plain_walk()[0])
+    assert np.array_equal(fitted.scored, ~held_out.scored)
+    assert held_out.begin == pytest.approx(7.0, abs=0.03)
+    assert len(fitted.base.time) == len(fitted.log)
+    every = segment_log(held_out.log, held_out.base, 0.2, (held_out.begin,))
+    assert np.array_equal(np.concatenate([fitted.segments.rows, held_out.segments.rows]), every.rows)
+    assert np.array_equal(np.concatenate([fitted.segments.position, held_out.segments.position]), every.position)
+    assert not np.any(fitted.compared & held_out.compared[: len(fitted.log)])
+    assert fitted.compared[fitted.segments.rows[:, 0]].all()
+    assert held_out.compared[held_out.segments.rows[:, 0]].all()
 
 
 def test_a_fall_ends_a_walk() -> None:
     log, _ = record_walk(Gait(), 5.0, push=lambda t: np.array([0.0, 25.0 * (3.0 < t < 3.4), 0.0]))
-    walk = make_walk(load_robot("nao"), log)
-    assert walk.base is not None
-    assert any(e.kind == "fall" for e in walk.base.events)
-    assert 2.5 < walk.time[-1] < 3.6
-    assert len(walk.base.time) == len(walk)
+    walked, base = reconstruct(load_robot("nao"), log)
+    assert any(e.kind == "fall" for e in base.events)
+    assert 2.5 < walked.time[-1] < 3.6
+    assert len(base.time) == len(walked)
 
 
-def test_the_length_of_windows_weighs_information_against_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(walk_module, "LENGTHS", (0.1, 0.2))
-    monkeypatch.setattr(walk_module, "TRIED", 4)
-    walk = cut_up(load_robot("nao"), make_walk(load_robot("nao"), plain_walk()[0]), (7.0,), threads=2)
-    assert [c.seconds for c in walk.choices] == pytest.approx([0.2, 0.1])  # the model is right: longer is better
-    longer, shorter = walk.choices
+def test_the_length_of_segments_weighs_information_against_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segments_module, "LENGTHS", (0.1, 0.2))
+    monkeypatch.setattr(segments_module, "TRIED", 4)
+    segments, lengths = segment_best(load_robot("nao"), *reconstructed(), (7.0,), threads=2)
+    assert [c.seconds for c in lengths] == pytest.approx([0.2, 0.1])  # the model is right: longer is better
+    longer, shorter = lengths
     assert longer.information > shorter.information
     assert longer.misfit < 2.0
     assert longer.score == pytest.approx(longer.information - np.log(longer.misfit))
-    assert walk.seconds == pytest.approx(0.2)
+    assert segment_seconds(segments, reconstructed()[0]) == pytest.approx(0.2)
 
 
 def test_a_log_with_too_little_walking_is_refused() -> None:
     log, _ = plain_walk()
     with pytest.raises(LogError, match="record more walking"):
-        lay_windows(make_walk(load_robot("nao"), log.window(0, 30)), 0.2)
+        segment_log(*reconstruct(load_robot("nao"), log.window(0, 30)), 0.2)
 
 
 # --- fits -----------------------------------------------------------------------------------------------
@@ -473,5 +469,5 @@ def test_the_recorded_fall_is_not_scored(shared_data: Path) -> None:
     folder = shared_data / "nao_walk"
     robot = load_robot(str(folder / "nominal_free.xml"))
     study = make_study(robot, [read_log(folder / "walk_fall.parquet")], threads=2)
-    assert study.train[0].time[-1] < 9.0
-    assert all(log.time[-1] < 9.0 for log in study.holdout)
+    assert study.train[0].log.time[-1] < 9.0
+    assert all(episode.log.time[-1] < 9.0 for episode in study.holdout)

@@ -526,7 +526,7 @@ np.save(sys.argv[3], np.array(places))
 def plain_loss(path: Path, model: Identified, folder: Path) -> tuple[float, float]:
     """Loss on held-out data by MuJoCo alone, in a process that knows nothing of this package; and as reported."""
     episode = model.study.holdout_problem(model.model).episodes[0]
-    replay, log = episode.replay, model.study.holdout[0]
+    replay, log = episode.replay, model.study.holdout[0].log
     joints = replay.index.joints
     np.savez(
         folder / "given.npz",

@@ -23,7 +23,7 @@ from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
-    from sysid_btr.btr.study import TrialStudy
+    from sysid_btr.identify.study import Study
 
 LOGS, FEWEST = 4, 2
 """Trials that are looked at, half of them held out, at most and at least."""
@@ -92,7 +92,7 @@ def join_effects(
 
 def _look(
     stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int, progress: Progress
-) -> tuple[Joined, TrialStudy | None]:
+) -> tuple[Joined, Study | None]:
     """Look for effects that are the same all over the robot, with bodies as they are and drives free.
 
     Few trials of one gait tell masses or lengths from nothing else: free, they take the place of what is missing.
@@ -142,7 +142,7 @@ def _look(
     return Joined(message, Model.joined([*fitted, *joining.parts]), spent), study
 
 
-def _tell_apart(study: TrialStudy, found: Model, declared: int, left: float) -> tuple[Model, float, int]:
+def _tell_apart(study: Study, found: Model, declared: int, left: float) -> tuple[Model, float, int]:
     """The model with amounts of their own at every place for effects where held-out trials want that.
 
     The first `declared` terms stay; `left` is the mean squared held-out error so far. Returned with that of the model,

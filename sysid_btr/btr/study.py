@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,14 +17,13 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.btr.problems import Stage, on_clock
 from sysid_btr.btr.trials import Tried
 from sysid_btr.btr.world import World
-from sysid_btr.identify.study import Study, measure_scales
+from sysid_btr.floating_base.episode import FloatingProcedure
+from sysid_btr.identify.episode import Episode, Procedure
+from sysid_btr.identify.study import Study
 from sysid_btr.io.log import Log
-from sysid_btr.objectives.problem import Episode
-from sysid_btr.objectives.targets import make_targets
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Outputs, Term
-from sysid_btr.terms.model import Model, Terms
-from sysid_btr.terms.scales import Scales
+from sysid_btr.terms.model import Model
 
 CHANNELS = ("position",)
 PLAIN = Model.of(())
@@ -60,9 +60,18 @@ class TrialReplay(World):
         return self._walk(np.repeat(self.played, len(candidates), axis=0), candidates)
 
 
+class TrialProcedure(FloatingProcedure):
+    """How a fit goes about trials: as about any floating base, but where they began is known, and they are cheap."""
+
+    coarse_suffices: ClassVar[bool] = False
+
+    def coarse(self, numerics: Numerics) -> Numerics:
+        return numerics
+
+
 @dataclass(frozen=True, eq=False)
-class TrialStudy(Study):
-    """A study whose logs are trials, replayed whole from where they began.
+class TrialEpisode(Episode):
+    """A trial, replayed whole from where it began.
 
     Attributes
     ----------
@@ -71,39 +80,19 @@ class TrialStudy(Study):
 
     fixed: Model = PLAIN
 
-    @cached_property
-    def scales(self) -> Scales:
-        replays = [self._replay(log, (), effort=True) for log in self.train]
-        return measure_scales(self.robot, self.train, self.numerics, self.threads, replays)
+    procedure: ClassVar[Procedure] = TrialProcedure()
 
-    @property
-    def free(self) -> bool:
-        return True
-
-    @property
-    def rough(self) -> Numerics:
-        """That of the trials: it is cheap already."""
-        return self.numerics
-
-    def settled(self, model: Model, *, held: bool = True, anew: bool = True) -> Study:
-        """As it is: where a trial began is known."""
-        return self
-
-    def _replay(self, log: Log, terms: Sequence[Term], *, effort: bool = False) -> TrialReplay:
+    def replay(
+        self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0
+    ) -> TrialReplay:
         return TrialReplay(
-            self.robot, log, tuple(terms), self.numerics, effort=effort, threads=self.threads, fixed=self.fixed
+            self.robot, self.log, tuple(terms), numerics, effort=effort, threads=threads, fixed=self.fixed
         )
-
-    def _episode(self, log: Log, terms: Terms, channels: tuple[str, ...], begin: float) -> Episode:
-        run = self._replay(log, terms)
-        targets = self.with_inflation(log, make_targets(log, run.index.joints, channels, 0.0))
-        time = log.time - log.time[0]
-        return Episode(run, tuple(t.window(begin, np.inf, time) for t in targets))
 
 
 def trial_study(
     stage: Stage, logs: Sequence[Log], held_out: Sequence[Log], threads: int = 0, fixed: Model = PLAIN
-) -> TrialStudy:
+) -> Study:
     """Some trials to fit, and others to judge by.
 
     Parameters
@@ -113,17 +102,20 @@ def trial_study(
     threads : worker threads.
     fixed : terms that stay at given values.
     """
-    time = early(stage)
-    return TrialStudy(
-        robot=stage.world.robot,
-        train=tuple(on_clock(log, time) for log in logs),
-        holdout=tuple(on_clock(log, time) for log in held_out),
-        split=(0.0,) * len(held_out),
+    time, robot = early(stage), stage.world.robot
+
+    def episode(log: Log) -> TrialEpisode:
+        log = on_clock(log, time)
+        return TrialEpisode(robot, log, np.ones(len(log), dtype=bool), fixed)
+
+    return Study(
+        robot=robot,
+        train=tuple(map(episode, logs)),
+        holdout=tuple(map(episode, held_out)),
         channels=CHANNELS,
         numerics=stage.world.numerics,
         numerics_error=np.nan,
         threads=threads,
-        fixed=fixed,
     )
 
 

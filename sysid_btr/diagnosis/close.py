@@ -74,7 +74,7 @@ def close(
         state = State.of(first, journal)
         state = search(state, usable_effects(asked, study), selection, progress)
         state = eliminate(state, selection, progress)
-        floating = state.study.free
+        floating = state.study.procedure.leaves_ground_error
         verdict = verdict_of(selection, state.before, state.fitted, state.rivals, floating=floating)
         later = later_split(state.study, state.fitted, selection) if verdict == "unexplained" else None
         if later is None:
@@ -86,12 +86,12 @@ def close(
 
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
     """Effects that these logs could show at all, given mount and channels."""
-    free = any(log.meta.mount == "free" for log in study.train)
+    free = any(episode.log.meta.mount == "free" for episode in study.train)
     result = []
     for effect in effects:
         if effect.name.startswith("foot_") and not free:
             continue
-        if effect.needs == "enabled" and not any(_switched(log) for log in study.train):
+        if effect.needs == "enabled" and not any(_switched(episode.log) for episode in study.train):
             continue
         result.append(effect)
     return tuple(result)

@@ -105,8 +105,7 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
     if gone:
         rest = fitted.model.without(*gone, fitted.model.terms[-1])
         fitted = refit(study, rest.with_(hypothesis.term(study.scales), hypothesis.start))
-    if study.free:
-        study = study.settled(fitted.model)
+    study = study.with_initial_states(fitted.model)
     study, fitted = robust_refit(study, fitted, 1)
     state = replace(state, study=study, fitted=fitted, rivals=(*staying, rivals)).spent(spent + fitted.evaluations)
     return state.step(added=(str(hypothesis),))
@@ -135,7 +134,7 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     problem = shorten(study, rules.scan_seconds).train_problem(model)
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
     asked = _questions(state, library, problem, residual, rules)
-    if study.free and len(asked) > rules.glance_most:
+    if study.procedure.costly and len(asked) > rules.glance_most:
         glance = shorten(study, rules.glance_seconds).train_problem(model)
         linear = linearise(glance, model.values, step=study.stencil(model.terms))
         seen = scan(glance, model.values, *linear, asked, study.scales, rules)

@@ -250,8 +250,7 @@ def signature(study: Study, model: Model) -> dict[str, Any]:
     """
     torques = missing_torques(study.train_problem(model), model.values, study.scales)
     if not torques:
-        why = "its base was floating, and segments are too short" if study.free else "the replay fails or is too short"
-        return {"summary": f"not characterised: {why}", "joints": []}
+        return {"summary": f"not characterised: {study.procedure.no_torque}", "joints": []}
     loud = sorted((t for t in torques if t.chi2 >= LOUD), key=lambda t: -_blame(t))
     if not loud:
         return {"summary": "no torque at any joint: positions are at their noise floor", "joints": []}

@@ -28,7 +28,8 @@ def later_split(study: Study, fitted: Fitted, rules: Selection) -> Study | None:
         None if every column that is above its limit when held out is so when fitted, or if the logs held
         out are others than those fitted.
     """
-    if study.free or len(fitted.train_columns) != len(fitted.holdout_columns) or not any(study.split):
+    others = all(episode.scored[0] for episode in study.holdout)
+    if others or not study.procedure.moves_split or len(fitted.train_columns) != len(fitted.holdout_columns):
         return None
     hidden = hidden_columns(rules, fitted)
     if hidden is None:
@@ -38,18 +39,18 @@ def later_split(study: Study, fitted: Fitted, rules: Selection) -> Study | None:
     scale = np.array([t.sigma[k] / t.noise[k] for _, t, k in problem.columns])[problem.column_labels]
     excess = np.where(hidden[problem.column_labels], (residual * scale) ** 2 - 1, 0.0)
     by_block = np.bincount(problem.blocks, np.nan_to_num(excess))
-    train, split, first = list(study.train), list(study.split), 0
-    for i, log in enumerate(study.holdout):
-        time = log.time - log.time[0]
+    train, holdout, first = list(study.train), list(study.holdout), 0
+    for i, episode in enumerate(study.holdout):
+        time = episode.log.time - episode.log.time[0]
         count = int(time[-1] / BLOCK) + 1
-        cut = cut_time(np.maximum(by_block[first : first + count], 0.0), split[i], float(time[-1]), rules)
+        cut = cut_time(np.maximum(by_block[first : first + count], 0.0), episode.begin, float(time[-1]), rules)
         first += count
-        if cut > split[i]:
-            size = int(np.searchsorted(time, cut))
-            train[i], split[i] = log.window(0, size), float(time[size])
-    if split == list(study.split):
+        if cut > episode.begin:
+            fitted_now = np.arange(len(episode.scored)) < np.searchsorted(time, cut)
+            train[i], holdout[i] = train[i].scoring(fitted_now), episode.scoring(~fitted_now)
+    if holdout == list(study.holdout):
         return None
-    return replace(study, train=tuple(train), split=tuple(split))
+    return replace(study, train=tuple(train), holdout=tuple(holdout))
 
 
 def cut_time(excess: FloatArray, now: float, end: float, rules: Selection) -> float:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target
 from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Outputs, Term
@@ -140,7 +140,7 @@ class _Clock:
 
 
 def _deconvolve(
-    number: int, episode: Episode, target: Target, values: FloatArray, scales: Scales
+    number: int, episode: Comparison, target: Target, values: FloatArray, scales: Scales
 ) -> list[MissingTorque]:
     log = episode.replay.log
     clock = _Clock.over(log.time)
@@ -213,7 +213,7 @@ def _deconvolve(
 
 
 def _pulsed(
-    episode: Episode,
+    episode: Comparison,
     values: FloatArray,
     train: Term,
     rest: Sequence[float],
@@ -244,7 +244,7 @@ def _servo_as_measured(states: dict[str, FloatArray], period: float) -> FloatArr
     return np.asarray(states["servo"] + weights[2] * error + weights[3] * np.gradient(smooth, period))
 
 
-def _commands(episode: Episode, columns: Sequence[int] | np.ndarray) -> FloatArray:
+def _commands(episode: Comparison, columns: Sequence[int] | np.ndarray) -> FloatArray:
     grid = episode.replay.grid
     steps = np.minimum(grid.state[grid.before], grid.steps - 1)
     return np.asarray(grid.command[steps][:, columns])

@@ -10,7 +10,6 @@ from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.fixing import fix_unidentifiable
-from sysid_btr.identify.fusion import weigh_walks
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.refit import judge, refit
 from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
@@ -32,17 +31,17 @@ def with_intervals(state: State, rules: Selection) -> State:
         else:  # what half the step changes in the derivatives is far less than what is known of them
             residual = problem.residuals(model.values[None])[0]
         shift, known = numerics_shift(problem, model.values, jacobian, residual), None
-        if study.free:
-            weighed = weigh_walks(study, problem, model.values, jacobian, residual)
-            jacobian, residual = weighed.jacobian, weighed.residual
-            shift, known = np.hypot(shift, weighed.error), weighed.known
-            model = model.at(weighed.values)
+        fused = study.fuse(problem, model.values, jacobian, residual)
+        if fused is not None:
+            jacobian, residual = fused.jacobian, fused.residual
+            shift, known = np.hypot(shift, fused.error), fused.known
+            model = model.at(fused.values)
         found = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks, shift, known)
         bare = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks)
         clear = np.array([e.identifiable != "no" for e in bare])
         worst = np.max(np.abs(shift[clear]) / np.maximum([e.std for e in bare], 1e-300)[clear], initial=0.0)
-        settled = worst <= SHIFT_TOLERATED or study.numerics.integrator == "Euler" or study.free
-        if settled or refinement == rules.refinements:
+        final = study.numerics.integrator == "Euler" or not study.procedure.refines_step
+        if final or worst <= SHIFT_TOLERATED or refinement == rules.refinements:
             break
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, model, iterations=4))

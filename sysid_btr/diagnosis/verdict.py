@@ -39,7 +39,7 @@ def conclude(state: State, verdict: Verdict, rules: Selection, seconds: float) -
         left = signature(study, state.fitted.model)
     reported = state.reported
     if reported is None:
-        reported = judge(study, first.model) if study.free else state.fitted
+        reported = judge(study, first.model) if study.procedure.fuses else state.fitted
     after = score(study, reported.model)
     unit = "m" if all(s.slide for s in study.scales.values()) else "rad"
     return Closing(

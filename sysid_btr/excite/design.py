@@ -26,6 +26,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.estimators.registry import get_estimator
 from sysid_btr.excite.motion import MARGIN, Clock, Family, as_log, find_motors
+from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, estimates
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.identify.study import measure_scales
@@ -34,7 +35,7 @@ from sysid_btr.io.split import split_episodes
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.noise import NoiseFloor
-from sysid_btr.objectives.problem import Episode, ReplayProblem
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
@@ -252,7 +253,7 @@ class Experiment:
             threads=self.threads,
         )
         targets = self.sensors.targets(log.time, replay.index.joints)
-        return ReplayProblem((Episode(replay, targets),), self.terms.nominal)
+        return ReplayProblem((Comparison(replay, targets),), self.terms.nominal)
 
     def of_reference(self, log: Log, seconds: float) -> ReplayProblem:
         """The problem that a reference log poses, as far as `seconds` of it."""
@@ -272,7 +273,7 @@ class Experiment:
                 threads=self.threads,
             )
             targets = self.sensors.targets(part.time - part.time[0], replay.index.joints)
-            episodes.append(Episode(replay, targets))
+            episodes.append(Comparison(replay, targets))
         return ReplayProblem(tuple(episodes), self.terms.nominal)
 
 
@@ -289,7 +290,8 @@ def prepare(robot: Robot, parameters: Sequence[str], sensors: Sensors, log: Log,
     replay = Replay(robot, held, (), numerics, threads=threads)
     last = replay.predict(np.zeros((1, 0))).position[0, -1]
     rest = dict(zip(replay.index.joints, map(float, last), strict=True))
-    terms = Terms(parse_parameters(parameters, robot, measure_scales(robot, (log,), numerics, threads)))
+    scales = measure_scales(robot, (FixedEpisode.whole(robot, log),), numerics, threads)
+    terms = Terms(parse_parameters(parameters, robot, scales))
     return Experiment(robot, terms, sensors, numerics, threads, rest)
 
 

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.floating_base.estimate import NEAR, foot_loads, imu_columns, lowest_points, vertical
+from sysid_btr.floating_base.estimate import NEAR, BaseState, foot_loads, imu_columns, lowest_points, vertical
 from sysid_btr.floating_base.feet import touching_bodies
-from sysid_btr.floating_base.walk import Walk, starts_at
+from sysid_btr.floating_base.segments import FloatingReplay, starts_at
+from sysid_btr.io.log import Log
 from sysid_btr.mujoco_conventions import to_rotation
 from sysid_btr.objectives.covariance import Known, covariance
 from sysid_btr.objectives.noise import noise_floor
@@ -74,7 +75,7 @@ LEAST = 50
 
 
 @dataclass(frozen=True)
-class SampleSteps(WindowReplay):
+class SampleSteps(FloatingReplay):
     """Steps of one sample each, all from states of their own, without contact.
 
     Attributes
@@ -223,7 +224,7 @@ def without_ground(problem: ReplayProblem, values: FloatArray) -> Known | None:
         whatever the ground does, and where no estimate is found.
     """
     replays = [e.replay for e in problem.episodes]
-    chains = [_chain(r) for r in replays if isinstance(r, WindowReplay) and _suits(r)]
+    chains = [_chain(r) for r in replays if isinstance(r, FloatingReplay) and _suits(r)]
     free = np.flatnonzero([not p.name.startswith("foot_") for p in problem.parameters])
     if len(chains) < len(replays) or len(free) == 0:
         return None
@@ -264,12 +265,11 @@ def without_ground(problem: ReplayProblem, values: FloatArray) -> Known | None:
     return Known(free, mean, cov[:-1, :-1])
 
 
-def _suits(replay: WindowReplay) -> bool:
+def _suits(replay: FloatingReplay) -> bool:
     kinds = [type(m) for m in replay.all_terms]
     time = replay.log.time
     return (
-        isinstance(replay.log, Walk)
-        and replay.log.base is not None
+        replay.base is not None
         and len(time) >= LEAST
         and float(np.ptp(np.diff(time))) < 1e-4 * float(time[1] - time[0])
         and replay.numerics.servo_period is None
@@ -298,19 +298,18 @@ def _written(replay: WindowReplay, values: FloatArray) -> BatchModel:
     return rig
 
 
-def _chain(replay: WindowReplay) -> _Chain:
+def _chain(replay: FloatingReplay) -> _Chain:
     """A walk with its states as they were reconstructed, and the weight shared out evenly among what touches."""
     import mujoco
 
-    walk = replay.log
-    assert isinstance(walk, Walk)
-    assert walk.base is not None
-    base, n = walk.base, len(walk)
+    walk, base = replay.log, replay.base
+    assert base is not None
+    n = len(walk)
     states = starts_at(base, np.stack([np.arange(n), np.arange(n) + 2], axis=1))
     own = {f.name: getattr(replay, f.name) for f in fields(replay)} | {"effort": False}
     steps = SampleSteps(**{**own, "windows": states.chosen(np.arange(n - 1))})
     weight = GRAVITY * float(mujoco.mj_getTotalmass(steps.model))
-    near = _touching(steps.model, walk)
+    near = _touching(steps.model, walk, base)
     touch = near[:-1] | near[1:]
     share = touch / np.maximum(touch.sum(axis=1, keepdims=True), 1)
     wrench = np.zeros((n - 1, touch.shape[1], 6))
@@ -336,12 +335,11 @@ def _chain(replay: WindowReplay) -> _Chain:
     )
 
 
-def _touching(model: mujoco.MjModel, walk: Walk) -> BoolArray:
+def _touching(model: mujoco.MjModel, walk: Log, base: BaseState) -> BoolArray:
     """Which feet may touch, (n, f): rather too often than too seldom, by a sample either way."""
-    assert walk.base is not None
     feet = touching_bodies(model)
     load = foot_loads(model, feet, walk, [])
-    low = lowest_points(model, feet, walk.base)
+    low = lowest_points(model, feet, base)
     above = low - low.min(axis=1, keepdims=True)
     if load is None:
         near = above < NEAR

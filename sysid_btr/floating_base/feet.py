@@ -143,3 +143,11 @@ def force_columns(model: mujoco.MjModel, feet: Sequence[Foot], sites: Sequence[s
 def _same_start(a: str, b: str) -> int:
     """Number of leading characters that two names share."""
     return next((k for k, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
+
+
+def up_to_base(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and those between it and the base, outermost first."""
+    base, chain = base_body(model), [body]
+    while int(model.body_parentid[chain[-1]]) not in (base, 0):
+        chain.append(int(model.body_parentid[chain[-1]]))
+    return chain

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.floating_base.walk import Walk
 from sysid_btr.identify.numerics import held_numerics
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten
 from sysid_btr.identify.study import Study
@@ -26,9 +25,9 @@ STIFFER = (0.6, 0.35, 0.25)
 
 def weigh_columns(study: Study, model: Model) -> tuple[Study, Fitted]:
     """The study with each column weighed by the error that a first fit from a model leaves in it, and that fit."""
-    study, coarse = settled_refit(study, model) if study.free else (study, refit(study, model))
+    study, coarse = first_fit(study, model)
     if float(coarse.train_columns.max()) > MISFIT:
-        if not study.free:  # windows are weighed one by one already
+        if not study.procedure.weighs_segments:
             study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS)
         study = inflate(study, coarse, memory=True)
     return study, coarse
@@ -41,7 +40,7 @@ def realise_servo(study: Study, model: Model) -> Study:
     """
     if study.numerics.integrator != "Euler":
         return study
-    held = held_numerics(study.robot, study.train[0], study.threads)
+    held = held_numerics(study.robot, study.train[0].log, study.threads)
     if held is None:
         return study
     short = shorten(study, SERVO_SECONDS)
@@ -52,20 +51,23 @@ def realise_servo(study: Study, model: Model) -> Study:
     return replace(study, numerics=held) if misfit[0] < misfit[1] - SERVO_MARGIN else study
 
 
-def settled_refit(study: Study, model: Model) -> tuple[Study, Fitted]:
-    """First fit of walks: parameters, and starts of windows, in turn, with a cheap integrator."""
-    numerics = study.numerics
-    study = replace(study, numerics=study.rough)
-    first = best_start(study, model.terms, contact_starts(model))
-    coarse = refit(study, model.at(first), iterations=5)
-    study = study.settled(coarse.model, held=False, anew=False)
-    again = refit(study, coarse.model, iterations=3)
-    study = replace(study.settled(again.model), numerics=numerics)
-    spent = again.evaluations + coarse.evaluations
-    if all(isinstance(log, Walk) for log in study.train):
-        return study, judge(study, again.model, spent)
+def first_fit(study: Study, model: Model) -> tuple[Study, Fitted]:
+    """First fit: where initial states are uncertain, of them and the parameters in turn, by the coarse integrator."""
+    procedure, reference, spent = study.procedure, study.numerics, 0
+    if not procedure.alternations:
+        return study, refit(study, model)
+    study = replace(study, numerics=study.coarse)
+    model = model.at(best_start(study, model.terms, contact_starts(model)))
+    for turn, iterations in enumerate(procedure.alternations, 1):
+        found = refit(study, model, iterations=iterations)
+        model, spent = found.model, spent + found.evaluations
+        last = turn == len(procedure.alternations)
+        study = study.with_initial_states(model, held_out=last, anew=last)
+    study = replace(study, numerics=reference)
+    if all(episode.procedure.coarse_suffices for episode in study.train):
+        return study, judge(study, model, spent)
     # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model
-    right = refit(study, again.model)
+    right = refit(study, model)
     return study, replace(right, evaluations=right.evaluations + spent)
 
 

@@ -16,9 +16,8 @@ from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.coarse import realise_servo, weigh_columns
-from sysid_btr.identify.deferred import LEAST_GAIN, deferred_fit
+from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fixing import fix_unidentifiable
-from sysid_btr.identify.fusion import weigh_walks
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
 from sysid_btr.identify.outcome import study_result
 from sysid_btr.identify.scores import Scores, score
@@ -46,7 +45,7 @@ class Fit:
     estimates : one a parameter.
     nominal, before : scores of the plain and of the fitted model on fitted and held-out data.
     result : what the estimator returned.
-    numerics_shift : (p,) change of the estimates when the step is halved; on walks with the error of `weigh_walks`.
+    numerics_shift : (p,) change of the estimates when the step is halved; on walks with the error of `Fused`.
     replays : candidates simulated.
     seconds : wall time.
     optimum : (p,) the model's values, but for walks whose motion tells more than replays do: there, where residuals
@@ -184,10 +183,10 @@ def fit(
         shift = at.shift
     problem, values, jacobian, residual = at.problem, at.values, at.jacobian, at.residual
     known, optimum = None, values
-    if study.free:
-        weighed = weigh_walks(study, problem, values, jacobian, residual, follow=solved.by_residuals)
-        values, jacobian, residual = weighed.values, weighed.jacobian, weighed.residual
-        shift, known = np.hypot(shift, weighed.error), weighed.known
+    fused = study.fuse(problem, values, jacobian, residual, follow=solved.by_residuals)
+    if fused is not None:
+        values, jacobian, residual = fused.values, fused.jacobian, fused.residual
+        shift, known = np.hypot(shift, fused.error), fused.known
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift, known)
     if solved.by_residuals:
         values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known)
@@ -247,13 +246,12 @@ class _Search:
             return _Solved(study, problem, result, result.evaluations + spent, False)
         study, coarse = weigh_columns(study, model.at(problem.start))
         problem, spent = study.train_problem(coarse.model), spent + coarse.evaluations
-        if study.free:
-            step = study.stencil(model.terms)
+        if study.procedure.deferred:
             result = deferred_fit(
                 problem,
-                study.rough,
-                estimator.for_rough_objective(step, LEAST_GAIN),
-                step=step,
+                study.cheap,
+                study.procedure.suited(estimator),
+                step=study.stencil(model.terms),
                 rng=rng,
                 budget=budget,
                 journal=journal,

@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
-from sysid_btr.floating_base.walk import Walk
 from sysid_btr.identify.scores import ChannelScore, channel_entries
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
 from sysid_btr.result import SCHEMA, clean, versions
 from sysid_btr.units import si_all
-
-COUNTED_LESS = 0.9
-"""Weight below which a segment of a floating-base log counts as one that the model does not explain."""
 
 
 def study_result(
@@ -67,6 +60,7 @@ def replay_result(
 
 
 def _provenance(study: Study) -> dict[str, Any]:
+    walks = _walks(study)
     return {
         "units": channel_units(study.robot),
         "numerics": {
@@ -76,7 +70,7 @@ def _provenance(study: Study) -> dict[str, Any]:
             "chosen": str(study.numerics),
         },
         "channels": study.channels,
-        **({"walks": _walks(study)} if study.free else {}),
+        **({"walks": walks} if walks else {}),
         "versions": versions(),
         "logs": _logs(study),
         "model": study.robot.to_dict(),
@@ -86,30 +80,20 @@ def _provenance(study: Study) -> dict[str, Any]:
 def _walks(study: Study) -> list[dict[str, Any]]:
     """How each floating-base log was segmented, and what its base state lacks."""
     return [
-        {
-            "path": None if log.path is None else str(log.path),
-            "part": part,
-            "window": log.seconds,
-            "windows": len(log.windows),
-            "counted_less": int(np.sum(log.marginal.weight < COUNTED_LESS)) if log.marginal is not None else 0,
-            "windows_tried": [asdict(choice) for choice in log.choices],
-            "events": [str(event) for event in log.base.events],
-            "used_until": float(log.time[-1]),
-            "lost": log.base.lost,
-        }
-        for part, logs in (("train", study.train), ("holdout", study.holdout))
-        for log in logs
-        if isinstance(log, Walk) and log.windows is not None and log.base is not None
+        {"path": None if episode.log.path is None else str(episode.log.path), "part": part, **facts}
+        for part, episodes in (("train", study.train), ("holdout", study.holdout))
+        for episode in episodes
+        if (facts := episode.facts()) is not None
     ]
 
 
 def _logs(study: Study) -> list[dict[str, Any]]:
     from sysid_btr.io.parquet import sha256
 
-    fitted = {log.path for log in study.train}
-    held = {log.path for log in study.holdout}
+    fitted = {episode.log.path for episode in study.train}
+    held = {episode.log.path for episode in study.holdout}
     entries = []
-    for path in dict.fromkeys(log.path for log in (*study.train, *study.holdout)):
+    for path in dict.fromkeys((*(e.log.path for e in study.train), *(e.log.path for e in study.holdout))):
         parts = [name for name, paths in (("train", fitted), ("holdout", held)) if path in paths]
         entries.append(
             {

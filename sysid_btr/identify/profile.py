@@ -20,7 +20,6 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.deferred import LEAST_GAIN
 from sysid_btr.identify.intervals import Profile
 from sysid_btr.objectives.covariance import RANK, spread
 from sysid_btr.objectives.problem import Conditional
@@ -58,15 +57,12 @@ def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = s
         raise UsageError(f"--profile {name} is not a free parameter; there are {', '.join(names)}")
     problem = fit.study.train_problem(fit.model)
     index = names.index(name)
-    estimator = LeastSquares()
-    if fit.study.free:
-        estimator = estimator.for_rough_objective(fit.study.stencil(fit.model.terms), LEAST_GAIN)
     return profile_curve(
         problem,
         problem.blocks,
         index,
         points,
-        estimator=estimator,
+        estimator=fit.study.procedure.suited(LeastSquares()),
         shift=float(fit.numerics_shift[index]),
         unit=parameters[index].unit,
         progress=progress,

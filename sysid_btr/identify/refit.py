@@ -11,10 +11,8 @@ from sysid_btr.estimators.base import Budget, Progress, Termination, silent
 from sysid_btr.estimators.evaluator import Evaluator, Stop
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.floating_base.walk import Walk
 from sysid_btr.identify.deferred import LEAST_GAIN, deferred_fit
 from sysid_btr.identify.study import Study
-from sysid_btr.io.log import Log
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.model import Model, Terms
@@ -102,16 +100,15 @@ def refit(
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
     structural, step = model.terms.structural, study.stencil(model.terms)
-    if study.free:
-        estimator = estimator.for_rough_objective(step, LEAST_GAIN)
-    elif structural:
+    estimator = study.procedure.suited(estimator)
+    if structural:
         estimator = replace(estimator, forward_step=step, central_step=step)
     rng, budget = np.random.default_rng(0), Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
     # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
     costly = structural or model.terms.have_laws
-    cheaper = study.free or not (polish or costly)
+    cheaper = study.procedure.deferred or not (polish or costly)
     if cheaper and study.numerics != study.cheap:
         result = deferred_fit(
             problem,
@@ -142,10 +139,6 @@ def best_start(study: Study, terms: Terms, starts: FloatArray) -> FloatArray:
         raise KeyboardInterrupt from None
     best = int(np.argmin(losses))
     return np.asarray(starts[best if losses[best] < NOTICEABLE * losses[0] else 0])
-
-
-MOST_WALKED = 8.0
-"""s of windows on which hypotheses about a walk are compared."""
 
 
 def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:
@@ -209,8 +202,9 @@ def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitt
 def inflated(study: Study, fitted: Fitted) -> tuple[Study, Fitted]:
     """The study with inflated noise, and what was fitted as it judges that."""
     study = inflate(study, fitted)
-    if not study.free:  # scores are in noise floors; only starts of windows take up more where columns count less
+    if not study.procedure.weighs_segments:
         return study, fitted
+    # scores are in noise floors, but initial states take up more where columns count less
     return study, judge(study, fitted.model, fitted.evaluations)
 
 
@@ -273,14 +267,5 @@ def paired_t(better: Fitted, worse: Fitted) -> float:
 
 
 def shorten(study: Study, seconds: float) -> Study:
-    """The same study with at most the first so many seconds of each training log.
-
-    Of walks it keeps some of their windows, and a cheaper integrator.
-    """
-    def begin(log: Log) -> Log:
-        if isinstance(log, Walk):
-            return log.thinned(min(seconds, MOST_WALKED))
-        stop = max(int(np.searchsorted(log.time, log.time[0] + seconds)), 2)
-        return log.once(("begin", stop), lambda: log.window(0, stop))
-
-    return replace(study, train=tuple(begin(log) for log in study.train), numerics=study.rough)
+    """The same study with at most so many seconds of each training log, and a coarse integrator where that will do."""
+    return replace(study, train=tuple(e.shortened(seconds) for e in study.train), numerics=study.coarse)

@@ -72,7 +72,7 @@ def with_short_steps(
     spent = 0
     for _ in range(MAX_REFINEMENTS):
         shift = at.shift
-        if study.free or study.numerics.integrator == "Euler" or _short_enough(at, shift):
+        if not study.procedure.refines_step or study.numerics.integrator == "Euler" or _short_enough(at, shift):
             break
         study = replace(study, numerics=study.numerics.halved())
         problem = study.train_problem(model.at(at.values))

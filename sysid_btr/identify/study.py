@@ -2,50 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.errors import ModelError
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.executors.base import HERE, Executor
-from sysid_btr.floating_base.walk import (
-    FASTEST,
-    Walk,
-    covered,
-    cut_up,
-    lay_windows,
-    make_replay,
-    make_walk,
-    settle,
-    walk_numerics,
-)
-from sysid_btr.identify.numerics import choose_numerics
+from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure, episode_of, split_episode
 from sysid_btr.io.log import Log
-from sysid_btr.io.split import holdout_split, split_episodes
-from sysid_btr.models.robot import Robot, joint_names
+from sysid_btr.io.split import split_episodes
+from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import slides
-from sysid_btr.objectives.problem import Episode, ReplayProblem
-from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP, Target, make_targets
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
+from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Model, Terms, as_model
 from sysid_btr.terms.scales import JointScale, Scales
 
 TINY = 1e-9
-WIDE_STEP = 2e-2
-"""Finite-difference step, fraction of the range, that is wide against the roughness of impacts: at a fifth of it a
-third of a derivative by a mass is chance, which passes for information, and drags estimates along."""
-
-ROUGH_STEP = 1e-2
-"""The same against teeth that meet: from there on, wider ones tell of no less information."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +35,8 @@ class Study:
     Attributes
     ----------
     robot : the model.
-    train, holdout : episodes; a held-out part of a training log keeps the samples before it, so that its
-        replay starts where the log does, and scores only what was not fitted.
-    split : (s) for each held-out episode the time from which it is scored.
+    train, holdout : episodes, each with the samples that count; a held-out part of a training log keeps the samples
+        before it, so that its replay starts where the log does, and scores only what was not fitted.
     channels : channels that are fitted.
     numerics : integrator and step; chosen by a convergence check.
     inflation : (mount, channel, joint) -> factor on its noise floor in what is minimised; 1 where silent. Keeps a
@@ -69,14 +48,13 @@ class Study:
     """
 
     robot: Robot
-    train: tuple[Log, ...]
-    holdout: tuple[Log, ...]
-    split: tuple[float, ...]
+    train: tuple[Episode, ...]
+    holdout: tuple[Episode, ...]
     channels: tuple[str, ...]
     numerics: Numerics
     numerics_error: float
     threads: int = 0
-    inflation: Mapping[tuple[str, str, str], float] = field(default_factory=dict)
+    inflation: Inflation = field(default_factory=dict)
     executor: Executor = HERE
     journal: Journal | None = None
 
@@ -91,105 +69,79 @@ class Study:
 
     def train_problem(self, model: Model | Iterable[Term]) -> ReplayProblem:
         """What is fitted, by a search that begins at a model; bare terms begin at their nominal values."""
-        model = as_model(model)
-        episodes = tuple(self._episode(log, model.terms, self.channels, 0.0) for log in self.train)
-        return ReplayProblem(episodes, model.values, self.executor)
+        return self._problem(self.train, as_model(model))
 
     def holdout_problem(self, model: Model | Iterable[Term]) -> ReplayProblem:
         """What is predicted without having been fitted."""
-        model = as_model(model)
-        episodes = tuple(
-            self._episode(log, model.terms, self.channels, begin)
-            for log, begin in zip(self.holdout, self.split, strict=True)
-        )
-        return ReplayProblem(episodes, model.values, self.executor)
+        return self._problem(self.holdout, as_model(model))
 
-    def _episode(self, log: Log, terms: Terms, channels: tuple[str, ...], begin: float) -> Episode:
-        robot = self.robot.for_log(log)
-        present = tuple(c for c in channels if any(log.has(c, j) for j in joint_names(robot)))
-        if isinstance(log, Walk):
-            log = log.only(begin)
-        replay = make_replay(
-            robot, log, terms, self.numerics, effort="effort" in present, threads=self.threads
-        )
-        targets = make_targets(log, replay.index.joints, present, 0.0 if isinstance(log, Walk) else WARM_UP)
-        if not targets:
-            raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
-        targets = self.with_inflation(log, targets)
-        if begin > 0:
-            time = log.time - log.time[0]
-            targets = tuple(t.window(begin, np.inf, time) for t in targets)
-        if isinstance(log, Walk):
-            inside = covered(log)[:, None]
-            targets = tuple(replace(t, mask=t.mask & inside) for t in targets)
-            return Episode(replay, targets, log.marginal)
-        return Episode(replay, targets)
+    def _problem(self, episodes: Iterable[Episode], model: Model) -> ReplayProblem:
+        return ReplayProblem(tuple(self._compare(e, model.terms) for e in episodes), model.values, self.executor)
 
-    def with_inflation(self, log: Log, targets: tuple[Target, ...]) -> tuple[Target, ...]:
-        """Targets of a log with the noise that columns of its mount are given."""
-        mount, factor = log.meta.mount, self.inflation
-        if not factor:
-            return targets
-        return tuple(
-            replace(t, sigma=t.noise * [factor.get((mount, t.channel, joint), 1.0) for joint in t.joints])
-            for t in targets
+    def _compare(self, episode: Episode, terms: Terms) -> Comparison:
+        return episode.compare(
+            terms, self.channels, self.numerics, inflation=self.inflation, threads=self.threads
         )
 
     def section(self) -> Journal:
         """What the next search keeps its record in."""
         return Journal() if self.journal is None else self.journal.section()
 
-    @property
-    def free(self) -> bool:
-        """Whether any log is of a free base."""
-        return any(isinstance(log, Walk) for log in (*self.train, *self.holdout))
+    @cached_property
+    def procedure(self) -> Procedure:
+        """How a fit goes about these episodes: as the most demanding kind among them asks for."""
+        return max((e.procedure for e in (*self.train, *self.holdout)), key=lambda p: p.demand)
 
     @property
-    def rough(self) -> Numerics:
-        """A cheaper integrator for walks: good enough for first fits and for derivatives by the starts."""
-        return Numerics("implicitfast", min(self.numerics.timestep, FASTEST)) if self.free else self.numerics
+    def coarse(self) -> Numerics:
+        """See `Procedure.coarse`."""
+        return self.procedure.coarse(self.numerics)
 
     @property
     def cheap(self) -> Numerics:
-        """Integrator and step of derivatives: a fraction of the cost, and as far off as a step of first order is."""
-        if self.free:
-            return self.rough
-        return replace(self.numerics, integrator="implicitfast") if self.numerics.integrator == "RK4" else self.numerics
-
-    def relaid(self) -> Study:
-        """The study with the windows of walks half a window later; held-out walks keep theirs."""
-        return replace(
-            self,
-            train=tuple(
-                lay_windows(log, log.seconds, late=0.5) if isinstance(log, Walk) else log for log in self.train
-            ),
-        )
+        """See `Procedure.cheap`."""
+        return self.procedure.cheap(self.numerics)
 
     def stencil(self, terms: Terms) -> float:
-        """Finite-difference step, fraction of a parameter's range: wide where impacts roughen the objective."""
-        if self.free:
-            return WIDE_STEP
-        return ROUGH_STEP if terms.structural else LeastSquares.central_step
+        """See `Procedure.stencil`."""
+        return self.procedure.stencil(terms)
 
-    def settled(self, model: Model, *, held: bool = True, anew: bool = True) -> Study:
-        """The study with the starts of its windows moved to where the data want them under these parameters.
+    def fuse(
+        self,
+        problem: ReplayProblem,
+        values: FloatArray,
+        jacobian: FloatArray,
+        residual: FloatArray,
+        *,
+        follow: bool = True,
+    ) -> Fused | None:
+        """See `Procedure.fuse`."""
 
-        `held` says whether those of held-out windows too, which only judge; `anew` whether known derivatives with
-        respect to starts are taken again.
+        def elsewhere(values: FloatArray) -> ReplayProblem:
+            model = Model(problem.terms, values)
+            return self.with_later_segments().with_initial_states(model, held_out=False).train_problem(model)
+
+        return self.procedure.fuse(problem, values, jacobian, residual, elsewhere, follow=follow)
+
+    def with_later_segments(self) -> Study:
+        """The study with the segments of fitted episodes half a segment later; held-out ones keep theirs."""
+        return replace(self, train=tuple(episode.with_later_segments() for episode in self.train))
+
+    def with_initial_states(self, model: Model, *, held_out: bool = True, anew: bool = True) -> Study:
+        """The study with the initial states of its segments where the data want them under a model.
+
+        `held_out` says whether those of held-out segments too, which only judge; `anew` whether known derivatives
+        with respect to initial states are taken again.
         """
-        def settled(log: Log, begin: float) -> Log:
-            if not isinstance(log, Walk):
-                return log
-            log = log.only(begin)
-            episode = self._episode(log, model.terms, self.channels, begin)
-            return settle(log, episode.replay, episode.targets, model.values, self.rough, anew=anew)
+
+        def updated(episode: Episode) -> Episode:
+            compare = partial(self._compare, episode, model.terms)
+            return episode.with_initial_states(compare, model.values, self.coarse, anew=anew)
 
         return replace(
             self,
-            train=tuple(settled(log, 0.0) for log in self.train),
-            holdout=tuple(settled(log, begin) for log, begin in zip(self.holdout, self.split, strict=True))
-            if held
-            else self.holdout,
+            train=tuple(map(updated, self.train)),
+            holdout=tuple(map(updated, self.holdout)) if held_out else self.holdout,
         )
 
 
@@ -222,67 +174,38 @@ def make_study(
     UsageError
         If the held-out fraction is not between 0 and 1.
     """
-    episodes = [_ready(robot, e) for log in logs for e in split_episodes(log)]
-    train: list[Log] = []
-    held: list[Log] = []
-    split: list[float] = []
+    recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):
-        for episode in episodes:
-            fitted, _ = holdout_split(episode, float(holdout))
-            cut = float(episode.time[len(fitted)] - episode.time[0])
-            if isinstance(episode, Walk):
-                episode = cut_up(robot, episode, (cut,), threads)
-                fitted = episode.window(0, len(fitted))
-            train.append(fitted)
-            held.append(episode)
-            split.append(cut)
+        parts = [split_episode(robot, e, float(holdout), threads) for e in recordings]
+        train, held = [fitted for fitted, _ in parts], [left for _, left in parts]
     else:
-        train = [cut_up(robot, e, (), threads) if isinstance(e, Walk) else e for e in episodes]
-        held = [_ready(robot, e) for log in holdout for e in split_episodes(log)]
-        held = [cut_up(robot, e, (), threads) if isinstance(e, Walk) else e for e in held]
-        split = [0.0] * len(held)
+        train = [episode_of(robot, e, threads) for e in recordings]
+        held = [episode_of(robot, e, threads) for log in holdout for e in split_episodes(log)]
     study = Study(
         robot=robot,
         train=tuple(train),
         holdout=tuple(held),
-        split=tuple(split),
         channels=tuple(c for c in COMPARED if c in channels),
-        numerics=Numerics("RK4", 0.005),
+        numerics=Numerics("RK4", 0.005) if numerics is None else numerics,
         numerics_error=np.nan,
         threads=threads,
         executor=executor,
     )
     if numerics is None:
-        walks = [log for log in study.train if isinstance(log, Walk)]
-        if walks:
-            numerics, error = walk_numerics(robot, walks[0], threads)
-        else:
-            numerics, error = choose_numerics(robot, study.train[0], threads)
-        study = replace(study, numerics_error=error)
-    study = replace(study, numerics=numerics)
-    return study.settled(Model.of(())) if study.free else study
-
-
-def _ready(robot: Robot, episode: Log) -> Log:
-    """An episode with its base reconstructed, if that was free."""
-    return make_walk(robot, episode) if episode.meta.mount == "free" else episode
+        leading = max(train, key=lambda e: e.procedure.demand)
+        numerics, error = leading.choose_numerics(threads)
+        study = replace(study, numerics=numerics, numerics_error=error)
+    return study.with_initial_states(Model.of(()))
 
 
 def measure_scales(
-    robot: Robot,
-    logs: Sequence[Log],
-    numerics: Numerics,
-    threads: int = 0,
-    replays: Sequence[Replay] | None = None,
+    robot: Robot, episodes: Sequence[Episode], numerics: Numerics, threads: int = 0
 ) -> Scales:
-    """Sizes at every joint, from replays of the plain model; `replays` with efforts, if they are special ones."""
+    """Sizes at every joint, from replays of the plain model."""
     torque, velocity, acceleration, span = [], [], [], []
     measured: dict[str, list[FloatArray]] = {}
-    for i, log in enumerate(logs):
-        if replays is None:
-            replay: Replay = make_replay(robot.for_log(log), log, (), numerics, effort=True, threads=threads)
-        else:
-            replay = replays[i]
+    for episode in episodes:
+        log, replay = episode.log, episode.replay((), numerics, effort=True, threads=threads)
         outputs = replay.predict(np.zeros((1, 0)))
         joints = replay.index.joints
         assert outputs.effort is not None

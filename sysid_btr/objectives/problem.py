@@ -23,8 +23,8 @@ from sysid_btr.terms.model import Model, Terms
 
 
 @dataclass(frozen=True, eq=False)
-class Episode:
-    """One episode: its replay and what it is compared with.
+class Comparison:
+    """The replay of one episode and what it is compared with.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class ReplayProblem:
     executor : where candidates are simulated.
     """
 
-    episodes: tuple[Episode, ...]
+    episodes: tuple[Comparison, ...]
     start: FloatArray
     executor: Executor = HERE
 
@@ -159,7 +159,7 @@ class ReplayProblem:
         return result
 
     def errors(self, values: FloatArray) -> FloatArray:
-        """Errors, (r,), of one candidate (p,) in SI units, in the order of the residuals; see `Episode.errors`."""
+        """Errors, (r,), of one candidate (p,) in SI units, in the order of the residuals; see `Comparison.errors`."""
         return np.asarray(self.executor.run(ReplayProblem._errors, self, values[None], self.divided)[0])
 
     def _errors(self, candidates: FloatArray) -> FloatArray:

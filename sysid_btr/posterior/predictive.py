@@ -78,7 +78,8 @@ def predict_bands(study: Study, model: Model, draws: FloatArray) -> tuple[Band, 
     error = _fitted_error(study.train_problem(model), model.values)
     bands = []
     several = len(study.holdout) > 1
-    for log, episode in zip(study.holdout, study.holdout_problem(model).episodes, strict=True):
+    for episode in study.holdout_problem(model).episodes:
+        log = episode.replay.log
         sums = [np.zeros((3, *t.mask.shape)) for t in episode.targets]
         for _, outputs in episode.replay.chunks(draws):
             for total, target in zip(sums, episode.targets, strict=True):

@@ -102,7 +102,7 @@ def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, .
             predicted[i][name] = episode.replay.predict(model.values[None]).position[0]
     plain = study.holdout_problem(())
     for i, episode in enumerate(plain.episodes[:count]):
-        log, joints = study.holdout[i], episode.replay.index.joints
+        log, joints = study.holdout[i].log, episode.replay.index.joints
         label = f" ({log.path.stem})" if several and log.path is not None else ""
         target = next(t for t in episode.targets if t.channel == "position")
         for k, joint in enumerate(target.joints):
@@ -115,7 +115,7 @@ def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, .
                     command=log.channels.get(f"command.{joint}", np.full(len(log), np.nan)),
                     measured=target.measured[:, k],
                     predicted={name: p[:, column] for name, p in predicted[i].items()},
-                    split=study.split[i],
+                    split=study.holdout[i].begin,
                     noise=float(target.noise[k]),
                 )
             )

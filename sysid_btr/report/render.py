@@ -126,7 +126,8 @@ def scene_of(outcome: Fit | Closing) -> Scene:
     final = identified(outcome)
     study = final.study
     best: Scene | None = None
-    for i, log in enumerate(study.holdout[:EPISODES_SEARCHED]):
+    for i, episode in enumerate(study.holdout[:EPISODES_SEARCHED]):
+        log = episode.log
         robot = study.robot.for_log(log)
         model = compile_model(robot, log, (Backdrop(places=()),), study.numerics)
         index = make_index(model)
@@ -140,7 +141,7 @@ def scene_of(outcome: Fit | Closing) -> Scene:
             poses[name] = np.tile(model.qpos0, (len(joints), 1))
             poses[name][:, index.qpos] = joints
         time = log.time - log.time[0]
-        scene = _compared(model, time, poses, np.flatnonzero(time >= study.split[i]))
+        scene = _compared(model, time, poses, np.flatnonzero(episode.scored))
         if best is None or _most(scene) > _most(best):
             best = scene
     assert best is not None

@@ -136,7 +136,7 @@ def draft(model: Identified) -> Draft:
         If no MJCF can be made of it.
     """
     study = model.study
-    log = study.train[0]
+    log = study.train[0].log
     robot = study.robot.for_log(log)
     target = make_target(robot, log, _parts(model), study.numerics)
     why = ""
@@ -155,7 +155,7 @@ def draft(model: Identified) -> Draft:
 
 
 def _parts(model: Identified) -> tuple[Part, ...]:
-    robot = model.study.robot.for_log(model.study.train[0])
+    robot = model.study.robot.for_log(model.study.train[0].log)
     return make_parts(robot, model.written, model.study.numerics)
 
 
@@ -192,7 +192,7 @@ def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], 
 
 def _header(draft: Draft, costs: Sequence[str]) -> list[str]:
     study = draft.identified.study
-    logs = ", ".join(dict.fromkeys(log.path.name for log in study.train if log.path is not None)) or "a log"
+    logs = ", ".join(dict.fromkeys(e.log.path.name for e in study.train if e.log.path is not None)) or "a log"
     changed = sum(bool(c.attribute) for c in draft.changes)
     added = len(draft.changes) - changed
     lines = [
@@ -203,7 +203,7 @@ def _header(draft: Draft, costs: Sequence[str]) -> list[str]:
     ]
     if not draft.source.own:
         lines.append("It is a complete file of its own: there was no MJCF to change.")
-    if any(log.meta.mount == "fixed" for log in study.train) and _floats(draft):
+    if any(episode.log.meta.mount == "fixed" for episode in study.train) and _floats(draft):
         lines.append("In the log the robot was held; to replay it, take the free joint away.")
     delayed = [p for p in draft.target.parts if p.stand_in is not None and p.stand_in.name == "delay"]
     if delayed:

@@ -1,50 +1,38 @@
-"""What walks tell beside what they get wrong about their ground, alone and beside logs of a robot that hangs."""
+"""What walks tell beside what they get wrong about their ground, alone and beside logs of a fixed base."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.floating_base.contact_free import without_ground
-from sysid_btr.floating_base.walk import GROUND, GROUND_MASS, Walk, of_legs, repeated_error, walked_residuals
+from sysid_btr.floating_base.segments import FloatingReplay
+from sysid_btr.floating_base.strides import GROUND, GROUND_MASS, of_legs, repeated_error, walked_residuals
 from sysid_btr.identify.deferred import corrected
-from sysid_btr.identify.study import Study
-from sysid_btr.objectives.covariance import RANK, Known, covariance, newton
+from sysid_btr.identify.episode import Fused
+from sysid_btr.objectives.covariance import RANK, covariance, newton
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.terms.model import Model
+from sysid_btr.simulation.numerics import Numerics
+
+WIDE_STEP = 2e-2
+"""Finite-difference step, fraction of the range, that is wide against the roughness of impacts: at a fifth of it a
+third of a derivative by a mass is chance, which passes for information, and drags estimates along."""
 
 
-@dataclass(frozen=True, eq=False)
-class Weighed:
-    """A linearised fit of walks, and of other logs.
-
-    Attributes
-    ----------
-    values : (p,) estimates.
-    jacobian, residual : (r, p) and (r,) there; of walks among other logs as much as they are believed.
-    error : (p,) standard deviation beyond that of pieces of the log that are independent.
-    known : all parameters but the ground's as these residuals and motions without a ground tell them, where they do.
-    """
-
-    values: FloatArray
-    jacobian: FloatArray
-    residual: FloatArray
-    error: FloatArray
-    known: Known | None = None
-
-
-def weigh_walks(
-    study: Study,
+def fuse(
     problem: ReplayProblem,
     values: FloatArray,
     jacobian: FloatArray,
     residual: FloatArray,
+    elsewhere: Callable[[FloatArray], ReplayProblem],
+    coarse: Numerics,
     *,
     follow: bool = True,
-) -> Weighed:
+) -> Fused:
     """What errors that every stride repeats do to estimates; beside other logs, walks count for less by them.
 
     Weighed by the noise of its sensors alone, a walk would draw what a hanging robot tells better towards the errors
@@ -52,21 +40,23 @@ def weigh_walks(
 
     Parameters
     ----------
-    study, problem : with at least one walk.
+    problem : with at least one walk.
     values, jacobian, residual : (p,), (r, p), (r,) at the optimum, whitened.
+    elsewhere : candidate (p,) -> the same problem with segments that begin elsewhere.
+    coarse : integrator and step for derivatives there.
     follow : whether the estimates may; else all logs count by their noise. What another estimator or distance has found
         stays where it is.
     """
-    walked, moved = walked_residuals(problem), _placed_elsewhere(study, Model(problem.terms, values))
+    walked, moved = walked_residuals(problem), _linearised(elsewhere(values), coarse, values)
     if moved is None:
-        return Weighed(values, jacobian, residual, np.full(len(values), np.inf))
+        return Fused(values, jacobian, residual, np.full(len(values), np.inf))
     there, residual_there, walked_there = moved
     legs = of_legs(problem)
     # beside a robot that hangs, a walk does as much harm to them as it has a say
     masses = legs & walked.all() & _is_mass(problem)
     span = problem.upper - problem.lower
 
-    def weighed(weight: float) -> Weighed:
+    def weighed(weight: float) -> Fused:
         rows = np.where(walked, weight, 1.0)
         j, r = jacobian * rows[:, None], residual * rows
         step = np.zeros(len(values))
@@ -78,9 +68,9 @@ def weigh_walks(
         told = np.hypot(placed, repeated_error(problem, j, r))
         # what the ground does wrong everywhere is as much again, and more
         more = np.where(legs, (GROUND**2 - 1) * (told**2 + _noise_of(j, walked) ** 2), 0.0)
-        return Weighed(values + step, j, r, np.sqrt(told**2 + np.where(masses, GROUND_MASS**2, more)))
+        return Fused(values + step, j, r, np.sqrt(told**2 + np.where(masses, GROUND_MASS**2, more)))
 
-    def doubt(found: Weighed) -> float:
+    def doubt(found: Fused) -> float:
         std = np.sqrt(np.diag(covariance(found.jacobian, found.residual, problem.blocks)))
         return float(np.mean(np.log(np.clip(np.hypot(std, found.error) / span, 1e-12, 1.0))))
 
@@ -88,28 +78,27 @@ def weigh_walks(
         return weighed(1.0)
     if walked.all():
         return with_motion(problem, weighed(1.0))
-    apart = _apart(study, problem, values, jacobian, residual, walked)
+    apart = _apart(problem, values, jacobian, residual, walked, elsewhere, coarse)
     return min(map(weighed, WEIGHTS), key=doubt) if apart is None else apart
 
 
 def _apart(
-    study: Study,
     problem: ReplayProblem,
     values: FloatArray,
     jacobian: FloatArray,
     residual: FloatArray,
     walked: BoolArray,
-) -> Weighed | None:
+    elsewhere: Callable[[FloatArray], ReplayProblem],
+    coarse: Numerics,
+) -> Fused | None:
     """What walks and other logs tell, each by themselves, joined by their precision; None where walks are not told so.
 
     Nothing that a walk gets wrong about its ground then reaches into what a hanging robot tells.
     """
-    walks = tuple(i for i, log in enumerate(study.train) if isinstance(log, Walk))
-    alone = replace(study, train=tuple(study.train[i] for i in walks))
-    part = replace(problem, episodes=tuple(problem.episodes[i] for i in walks))
+    part = _of_walks(problem)
     own, rest = jacobian[walked], residual[walked]
     step = np.clip(newton(own, rest), problem.lower - values, problem.upper - values)
-    found = weigh_walks(alone, part, values + step, own, rest + own @ step)
+    found = fuse(part, values + step, own, rest + own @ step, lambda at: _of_walks(elsewhere(at)), coarse)
     if found.known is None:
         return None
     which, others = found.known.which, np.setdiff1d(np.arange(len(values)), found.known.which)
@@ -122,10 +111,15 @@ def _apart(
     moved[which] = joined.within(problem.lower, problem.upper)
     moved[others] += newton(own[:, others], rest + own @ (moved - values))
     moved = np.clip(moved, problem.lower, problem.upper)
-    return Weighed(moved, jacobian, residual + jacobian @ (moved - values), found.error, joined)
+    return Fused(moved, jacobian, residual + jacobian @ (moved - values), found.error, joined)
 
 
-def with_motion(problem: ReplayProblem, weighed: Weighed) -> Weighed:
+def _of_walks(problem: ReplayProblem) -> ReplayProblem:
+    """The problem in its walks alone."""
+    return replace(problem, episodes=tuple(e for e in problem.episodes if isinstance(e.replay, FloatingReplay)))
+
+
+def with_motion(problem: ReplayProblem, weighed: Fused) -> Fused:
     """A fit of walks with what their motion tells whatever the ground is.
 
     Both use the same encoders, so that only masses of legs are joined, which the fit tells so badly that counting its
@@ -181,16 +175,13 @@ def _noise_of(jacobian: FloatArray, rows: BoolArray) -> FloatArray:
     return np.asarray(np.linalg.norm(unit[rows] @ inverse, axis=0) / norm)
 
 
-def _placed_elsewhere(
-    study: Study, model: Model
+def _linearised(
+    problem: ReplayProblem, coarse: Numerics, values: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray] | None:
-    """Jacobian (r, p), residual (r,) and which of it is of walks, where windows begin elsewhere; None if that fails.
+    """Jacobian (r, p), residual (r,) and which of it is of walks; None if that fails.
 
-    In the right model the change of the estimates is a part of the noise; in another it is the least that the model's
-    error does.
+    Where segments begin elsewhere the change of the estimates is a part of the noise in the right model; in another it
+    is the least that the model's error does.
     """
-    relaid = study.relaid().settled(model, held=False)
-    problem = relaid.train_problem(model)
-    rough = corrected(problem, study.rough, model.values)
-    residual, jacobian = linearise(rough, model.values, step=study.stencil(model.terms))
+    residual, jacobian = linearise(corrected(problem, coarse, values), values, step=WIDE_STEP)
     return (jacobian, residual, walked_residuals(problem)) if np.isfinite(jacobian).all() else None

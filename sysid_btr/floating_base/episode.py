@@ -1,0 +1,216 @@
+"""Episodes of a floating base: segments that start from reconstructed states, known within an uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.errors import LogError
+from sysid_btr.floating_base.estimate import BaseState, estimate_base
+from sysid_btr.floating_base.fusion import WIDE_STEP, fuse
+from sysid_btr.floating_base.initial_states import update_initial_states
+from sysid_btr.floating_base.segments import (
+    FASTEST,
+    FloatingReplay,
+    SegmentLength,
+    covered,
+    segment_best,
+    segment_log,
+    segment_numerics,
+    segment_seconds,
+    spread_evenly,
+)
+from sysid_btr.identify.deferred import LEAST_GAIN
+from sysid_btr.identify.episode import E, Episode, Fused, Inflation, Procedure
+from sysid_btr.io.log import Log
+from sysid_btr.io.split import holdout_split
+from sysid_btr.models.robot import Robot
+from sysid_btr.objectives.marginal import Marginal
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
+from sysid_btr.simulation.compiling import compile_model, make_index
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.segments import Windows
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Terms
+
+MOST_WALKED = 8.0
+"""s of segments on which hypotheses about a walk are compared."""
+COUNTED_LESS = 0.9
+"""Weight below which a segment counts as one that the model does not explain."""
+
+
+class FloatingProcedure(Procedure):
+    """How a fit goes about episodes of a floating base: impacts roughen the objective, and no step is fine enough."""
+
+    demand: ClassVar[int] = 1
+    alternations: ClassVar[tuple[int, ...]] = (5, 3)
+    coarse_suffices: ClassVar[bool] = True
+    deferred: ClassVar[bool] = True
+    refines_step: ClassVar[bool] = False
+    weighs_segments: ClassVar[bool] = True
+    moves_split: ClassVar[bool] = False
+    fuses: ClassVar[bool] = True
+    costly: ClassVar[bool] = True
+    leaves_ground_error: ClassVar[bool] = True
+    no_torque: ClassVar[str] = "its base was floating, and segments are too short"
+
+    def coarse(self, numerics: Numerics) -> Numerics:
+        return Numerics("implicitfast", min(numerics.timestep, FASTEST))
+
+    def cheap(self, numerics: Numerics) -> Numerics:
+        return self.coarse(numerics)
+
+    def stencil(self, terms: Terms) -> float:
+        return WIDE_STEP
+
+    def suited(self, estimator: E) -> E:
+        return estimator.for_rough_objective(WIDE_STEP, LEAST_GAIN)
+
+    def fuse(
+        self,
+        problem: ReplayProblem,
+        values: FloatArray,
+        jacobian: FloatArray,
+        residual: FloatArray,
+        elsewhere: Callable[[FloatArray], ReplayProblem],
+        *,
+        follow: bool = True,
+    ) -> Fused | None:
+        coarse = self.coarse(problem.episodes[0].replay.numerics)
+        return fuse(problem, values, jacobian, residual, elsewhere, coarse, follow=follow)
+
+
+@dataclass(frozen=True, eq=False)
+class FloatingEpisode(Episode):
+    """An episode whose base was free, up to a fall.
+
+    Attributes
+    ----------
+    base : reconstructed motion, sample by sample of `log`.
+    segments : stretches of `log` that are replayed, and their initial states.
+    marginal : what the uncertainty of the initial states can do, once known.
+    lengths : lengths of segment that were tried, best first.
+    """
+
+    base: BaseState
+    segments: Windows
+    marginal: Marginal | None = None
+    lengths: tuple[SegmentLength, ...] = ()
+
+    procedure: ClassVar[Procedure] = FloatingProcedure()
+
+    @classmethod
+    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> FloatingEpisode:
+        """All of a recording, up to a fall.
+
+        Raises
+        ------
+        LogError, ModelError
+            If the base cannot be reconstructed, or too few segments fit in.
+        """
+        log, base = reconstruct(robot, log)
+        segments, lengths = segment_best(robot, log, base, (), threads)
+        return cls(robot, log, np.ones(len(log), dtype=bool), base, segments, None, lengths)
+
+    @classmethod
+    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[FloatingEpisode, FloatingEpisode]:
+        """A recording whose last fraction before a fall is held out; the fitted part says how long segments are."""
+        log, base = reconstruct(robot, log)
+        count = len(holdout_split(log, holdout)[0])
+        segments, lengths = segment_best(robot, log, base, (float(log.time[count] - log.time[0]),), threads)
+        fitted = np.arange(len(log)) < count
+        inside = fitted[segments.rows[:, 0]]
+        return (
+            cls(robot, log, fitted, base.rows(0, count), segments.chosen(np.flatnonzero(inside)), None, lengths),
+            cls(robot, log, ~fitted, base, segments.chosen(np.flatnonzero(~inside)), None, lengths),
+        )
+
+    @property
+    def compared(self) -> BoolArray:
+        return super().compared & covered(self.segments, len(self.log))
+
+    def replay(
+        self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0
+    ) -> FloatingReplay:
+        robot = self.robot.for_log(self.log)
+        return FloatingReplay(
+            robot, self.log, tuple(terms), numerics, effort, threads, windows=self.segments, base=self.base
+        )
+
+    def compare(
+        self,
+        terms: Terms,
+        channels: Sequence[str],
+        numerics: Numerics,
+        *,
+        inflation: Inflation | None = None,
+        threads: int = 0,
+    ) -> Comparison:
+        plain = super().compare(terms, channels, numerics, inflation=inflation, threads=threads)
+        return replace(plain, marginal=self.marginal)
+
+    def shortened(self, seconds: float) -> FloatingEpisode:
+        """The same samples with few segments, spread evenly over them."""
+        return self._with(spread_evenly(self.segments, self.log, min(seconds, MOST_WALKED)))
+
+    def _with(self, which: IntArray) -> FloatingEpisode:
+        marginal = None if self.marginal is None else self.marginal.chosen(which)
+        return replace(self, segments=self.segments.chosen(which), marginal=marginal)
+
+    def with_initial_states(
+        self, compare: Callable[[], Comparison], values: FloatArray, coarse: Numerics, *, anew: bool = True
+    ) -> FloatingEpisode:
+        comparison = compare()
+        assert isinstance(comparison.replay, FloatingReplay)
+        segments, marginal = update_initial_states(
+            comparison.replay, comparison.targets, self.marginal, values, coarse, anew=anew
+        )
+        return replace(self, segments=segments, marginal=marginal)
+
+    def with_later_segments(self) -> FloatingEpisode:
+        segments = segment_log(self.log, self.base, segment_seconds(self.segments, self.log), late=0.5)
+        return replace(self, segments=segments, marginal=None)
+
+    def choose_numerics(self, threads: int = 0) -> tuple[Numerics, float]:
+        return segment_numerics(self.robot, self.log, self.segments, threads)
+
+    def facts(self) -> Mapping[str, Any]:
+        weight = np.ones(0) if self.marginal is None else self.marginal.weight
+        return {
+            "window": segment_seconds(self.segments, self.log),
+            "windows": len(self.segments),
+            "counted_less": int(np.sum(weight < COUNTED_LESS)),
+            "windows_tried": [asdict(length) for length in self.lengths],
+            "events": [str(event) for event in self.base.events],
+            "used_until": float(self.log.time[-1]),
+            "lost": self.base.lost,
+        }
+
+
+def reconstruct(robot: Robot, log: Log) -> tuple[Log, BaseState]:
+    """One episode up to where the robot falls, and the motion of its base.
+
+    Raises
+    ------
+    LogError, ModelError
+        If the base cannot be reconstructed.
+    """
+    robot = robot.for_log(log)
+    model = compile_model(robot, log, robot.always, Numerics("RK4", FASTEST))
+    index = make_index(model)
+    base = estimate_base(model, log, index.joints, index.qpos)
+    stop = len(log)
+    if any(e.kind == "fall" for e in base.events):
+        stop = int(np.flatnonzero(base.usable)[-1]) + 1 if base.usable.any() else 0
+    if stop < 2:
+        raise LogError(f"log {log.path or ''}: nothing of it can be used: {', '.join(map(str, base.events))}")
+    if stop < len(log):
+        # what comes after a fall must not reach back through the smoother
+        events = base.events
+        base = estimate_base(model, log.window(0, stop), index.joints, index.qpos)
+        base = replace(base, events=events)
+    return log.window(0, stop), base

@@ -1,0 +1,295 @@
+"""Episodes: recordings of one run each, with the samples that count, as the kind of their base wants them replayed.
+
+`Log` is data and never changes. What a fit adds to it is an episode's: segments, initial states, and which samples are
+scored. Kinds differ in how they are replayed (`Episode`), and in how a fit goes about them (`Procedure`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import import_module
+from typing import Any, ClassVar, Self, TypeVar
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.errors import ModelError
+from sysid_btr.estimators.base import ResidualEstimator
+from sysid_btr.estimators.lsq import LeastSquares
+from sysid_btr.identify.numerics import choose_numerics
+from sysid_btr.io.log import Log
+from sysid_btr.io.split import holdout_split
+from sysid_btr.models.robot import Robot, joint_names
+from sysid_btr.objectives.covariance import Known
+from sysid_btr.objectives.problem import Comparison, ReplayProblem
+from sysid_btr.objectives.targets import WARM_UP, Target, make_targets
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Terms
+
+E = TypeVar("E", bound=ResidualEstimator)
+
+ROUGH_STEP = 1e-2
+"""Finite-difference step, fraction of the range, against teeth that meet: from there on, wider ones tell of no less
+information."""
+
+Inflation = Mapping[tuple[str, str, str], float]
+"""(mount, channel, joint) -> factor on its noise floor in what is minimised; 1 where silent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """A linearised fit together with what else its episodes tell.
+
+    Attributes
+    ----------
+    values : (p,) estimates.
+    jacobian, residual : (r, p) and (r,) there, each episode weighed by how much it is believed.
+    error : (p,) standard deviation beyond that of pieces of the log that are independent.
+    known : parameters as these residuals and motions without a ground tell them together, where they do.
+    """
+
+    values: FloatArray
+    jacobian: FloatArray
+    residual: FloatArray
+    error: FloatArray
+    known: Known | None = None
+
+
+class Procedure:
+    """How a fit goes about episodes of one kind; here those whose base is fixed, replayed whole.
+
+    Attributes
+    ----------
+    demand : of several kinds in one study the most demanding one's procedure is followed.
+    alternations : iterations of the first fits by the coarse integrator, after each of which the initial states are
+        updated.
+    coarse_suffices : whether a fit by the coarse integrator need not be repeated by the reference one before its
+        errors are judged.
+    deferred : whether derivatives are always taken by a cheaper integrator.
+    refines_step : whether half the step, where that moves an estimate, is nearer to the truth.
+    weighs_segments : whether segments are weighed one by one, by what is left in them under the columns' noise.
+    moves_split : whether the end of the fitted part can be moved.
+    fuses : whether `fuse` has more to say than the residuals.
+    costly : whether each candidate is a simulation of its own, so that fewer are asked for.
+    leaves_ground_error : whether the right model leaves an error that no effect explains: that of its ground.
+    no_torque : why the missing torque cannot be characterised, where it cannot.
+    """
+
+    demand: ClassVar[int] = 0
+    alternations: ClassVar[tuple[int, ...]] = ()
+    coarse_suffices: ClassVar[bool] = False
+    deferred: ClassVar[bool] = False
+    refines_step: ClassVar[bool] = True
+    weighs_segments: ClassVar[bool] = False
+    moves_split: ClassVar[bool] = True
+    fuses: ClassVar[bool] = False
+    costly: ClassVar[bool] = False
+    leaves_ground_error: ClassVar[bool] = False
+    no_torque: ClassVar[str] = "the replay fails or is too short"
+
+    def coarse(self, numerics: Numerics) -> Numerics:
+        """Integrator and step that are good enough for first fits, and for derivatives by the initial states."""
+        return numerics
+
+    def cheap(self, numerics: Numerics) -> Numerics:
+        """Integrator and step of derivatives: a fraction of the cost, and as far off as a step of first order is."""
+        return replace(numerics, integrator="implicitfast") if numerics.integrator == "RK4" else numerics
+
+    def stencil(self, terms: Terms) -> float:
+        """Finite-difference step, fraction of a parameter's range: wide where the objective is rough."""
+        return ROUGH_STEP if terms.structural else LeastSquares.central_step
+
+    def suited(self, estimator: E) -> E:
+        """An estimator with settings that suit the objective."""
+        return estimator
+
+    def fuse(
+        self,
+        problem: ReplayProblem,
+        values: FloatArray,
+        jacobian: FloatArray,
+        residual: FloatArray,
+        elsewhere: Callable[[FloatArray], ReplayProblem],
+        *,
+        follow: bool = True,
+    ) -> Fused | None:
+        """What the episodes tell beside the residuals, and get wrong in them; None where these say it all.
+
+        Parameters
+        ----------
+        problem : what was fitted.
+        values, jacobian, residual : (p,), (r, p), (r,) at the optimum, whitened.
+        elsewhere : candidate (p,) -> the same problem with segments that begin elsewhere.
+        follow : whether the estimates may move.
+        """
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Episode(ABC):
+    """A recording, and which of its samples count.
+
+    Attributes
+    ----------
+    robot : the model, before what the log's metadata say about it.
+    recording : all of the episode.
+    scored : (n,) samples that count: those that are fitted, or those that are held out.
+    """
+
+    robot: Robot
+    recording: Log
+    scored: BoolArray
+
+    procedure: ClassVar[Procedure] = Procedure()
+    warm_up: ClassVar[float] = 0.0
+    """s after its beginning that are not scored."""
+
+    @cached_property
+    def log(self) -> Log:
+        """The recording up to the last sample that counts: what comes later is not replayed."""
+        stop = int(np.flatnonzero(self.scored)[-1]) + 1 if self.scored.any() else 0
+        if stop == len(self.recording):
+            return self.recording
+        return self.recording.once(("begin", stop), lambda: self.recording.window(0, stop))
+
+    @property
+    def begin(self) -> float:
+        """Time of the first sample that counts, s since the first of all."""
+        return float(self.log.time[int(np.argmax(self.scored))] - self.log.time[0])
+
+    @property
+    def compared(self) -> BoolArray:
+        """(n,) samples of `log` that count and are replayed."""
+        return self.scored[: len(self.log)]
+
+    @abstractmethod
+    def replay(self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0) -> Replay:
+        """Its replay under some terms."""
+
+    def compare(
+        self,
+        terms: Terms,
+        channels: Sequence[str],
+        numerics: Numerics,
+        *,
+        inflation: Inflation | None = None,
+        threads: int = 0,
+    ) -> Comparison:
+        """Its replay, and what that is compared with.
+
+        Raises
+        ------
+        ModelError
+            If there is nothing to compare.
+        """
+        log = self.log
+        joints = joint_names(self.robot.for_log(log))
+        present = tuple(c for c in channels if any(log.has(c, j) for j in joints))
+        replay = self.replay(terms, numerics, effort="effort" in present, threads=threads)
+        targets = make_targets(log, replay.index.joints, present, self.warm_up)
+        if not targets:
+            raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
+        inside = self.compared[:, None]
+        inflated = (_with_noise(target, log.meta.mount, inflation or {}) for target in targets)
+        return Comparison(replay, tuple(replace(t, mask=t.mask & inside) for t in inflated))
+
+    def scoring(self, scored: BoolArray) -> Self:
+        """The same with other samples that count."""
+        return replace(self, scored=scored)
+
+    def shortened(self, seconds: float) -> Self:
+        """So many seconds of it at most."""
+        time = self.log.time
+        stop = max(int(np.searchsorted(time, time[0] + seconds)), 2)
+        return self.scoring(self.scored & (np.arange(len(self.scored)) < stop))
+
+    def with_initial_states(
+        self, compare: Callable[[], Comparison], values: FloatArray, coarse: Numerics, *, anew: bool = True
+    ) -> Self:
+        """The same with its initial states where the data want them under a candidate (p,), unless those are known.
+
+        Parameters
+        ----------
+        compare : makes the comparison of this episode.
+        coarse : integrator and step for derivatives with respect to the initial states.
+        anew : whether derivatives that are known are taken again.
+        """
+        return self
+
+    def with_later_segments(self) -> Self:
+        """The same with segments that begin half a segment later, if it has any."""
+        return self
+
+    def choose_numerics(self, threads: int = 0) -> tuple[Numerics, float]:
+        """Integrator and step to begin with, and the change in noise floors when the step is halved."""
+        return choose_numerics(self.robot, self.log, threads)
+
+    def facts(self) -> Mapping[str, Any] | None:
+        """What a result says about how it was segmented, and what its base state lacks; None where it is not."""
+        return None
+
+
+def _with_noise(target: Target, mount: str, inflation: Inflation) -> Target:
+    """A target with the noise that columns of its mount are given."""
+    if not inflation:
+        return target
+    factors = [inflation.get((mount, target.channel, joint), 1.0) for joint in target.joints]
+    return replace(target, sigma=target.noise * factors)
+
+
+@dataclass(frozen=True, eq=False)
+class FixedEpisode(Episode):
+    """One whose base is fixed: it is replayed whole, as one segment, from its first sample."""
+
+    warm_up: ClassVar[float] = WARM_UP
+
+    @classmethod
+    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> FixedEpisode:
+        """All of a recording."""
+        return cls(robot, log, np.ones(len(log), dtype=bool))
+
+    @classmethod
+    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[FixedEpisode, FixedEpisode]:
+        """A recording whose last fraction is held out, as what is fitted and as what is held out."""
+        fitted = np.arange(len(log)) < len(holdout_split(log, holdout)[0])
+        return cls(robot, log, fitted), cls(robot, log, ~fitted)
+
+    def replay(self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0) -> Replay:
+        return Replay(self.robot.for_log(self.log), self.log, tuple(terms), numerics, effort, threads)
+
+
+def episode_of(robot: Robot, log: Log, threads: int = 0) -> Episode:
+    """All of a recording as an episode of the kind that its mount asks for."""
+    made: Episode = _kind(log).whole(robot, log, threads)
+    return made
+
+
+def split_episode(robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[Episode, Episode]:
+    """A recording whose last fraction is held out: what is fitted, and what is held out.
+
+    Raises
+    ------
+    UsageError
+        If the held-out fraction is not between 0 and 1.
+    LogError
+        If a part would be too short, or the base cannot be reconstructed.
+    """
+    made: tuple[Episode, Episode] = _kind(log).split(robot, log, holdout, threads)
+    return made
+
+
+KINDS = {
+    "fixed": "sysid_btr.identify.episode:FixedEpisode",
+    "free": "sysid_btr.floating_base.episode:FloatingEpisode",
+}
+"""Mount of a log -> its kind of episode. By name: floating bases are a wing above this one."""
+
+
+def _kind(log: Log) -> Any:
+    module, _, name = KINDS[log.meta.mount].partition(":")
+    return getattr(import_module(module), name)
