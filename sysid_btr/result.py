@@ -54,7 +54,7 @@ def clean(value: Any) -> Any:
         return clean(asdict(value))
     if value is None or isinstance(value, str):
         return value
-    raise TypeError(f"{type(value).__name__} has no place in a result: {value!r}")
+    raise TypeError(f"{type(value).__name__} cannot be part of a result: {value!r}")
 
 
 def to_json(result: Mapping[str, Any]) -> str:
@@ -78,13 +78,13 @@ def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
     except OSError as error:
         began = (file.parent / "journal.jsonl").exists() or (file.parent / "journals").is_dir()
         todo = (
-            "the run in this folder has not ended: its command with --resume goes on with it"
+            "the run in this folder has not finished: repeat its command with --resume"
             if began
             else "give the --out folder of a finished run"
         )
         raise UsageError(f"cannot read {file}: {error.strerror}; {todo}") from error
     except UnicodeDecodeError:
-        raise UsageError(f"{file} is no result; give the --out folder of a finished run") from None
+        raise UsageError(f"{file} is not a result; give the --out folder of a finished run") from None
     except ValueError as error:
         raise UsageError(f"{file} is not JSON ({error}); give the result.json of a finished run") from error
     schema = content.get("schema") if isinstance(content, dict) else None

@@ -46,7 +46,7 @@ class Folder:
         try:
             inner.mkdir(exist_ok=True)
         except OSError as error:
-            raise UsageError(f"cannot make {inner}: {error.strerror}; choose another folder") from error
+            raise UsageError(f"cannot create {inner}: {error.strerror}; choose another folder") from error
         return Folder(inner)
 
     def write(self, name: str, content: str | bytes) -> Path:
@@ -68,7 +68,7 @@ class Folder:
             part.replace(target)
         except OSError as error:
             raise UsageError(
-                f"cannot write {target}: {error.strerror}; make room, or choose a folder that you may write to"
+                f"cannot write {target}: {error.strerror}; free some space, or choose a writable folder"
             ) from error
         finally:
             part.unlink(missing_ok=True)
@@ -90,7 +90,7 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
         If it holds results and neither is asked for, or it cannot be used.
     """
     if resume and overwrite:
-        raise UsageError("--resume goes on with what is there and --overwrite drops it: give one of the two")
+        raise UsageError("--resume continues the run that is there and --overwrite deletes it: give one of the two")
     if path.exists() and not path.is_dir():
         raise UsageError(f"--out {path} is a file; give a folder")
     try:
@@ -102,8 +102,8 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
     folder = Folder(path)
     if folder.held and not (resume or overwrite):
         raise UsageError(
-            f"--out {path} already holds results ({', '.join(folder.held)}) and they are not touched: "
-            "--resume goes on with an interrupted run, --overwrite replaces them, or choose another folder"
+            f"--out {path} already holds results ({', '.join(folder.held)}), which are not touched: --resume "
+            "continues an interrupted run, --overwrite replaces them, or choose another folder"
         )
     if overwrite:
         for old in (folder.journal, *path.glob(f"{JOURNAL}.*.npy")):

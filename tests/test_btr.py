@@ -712,4 +712,4 @@ def test_the_verb_refuses_what_it_does_not_have(capsys: pytest.CaptureFixture[st
     assert run([*COMMAND, "--exchange", str(tmp_path)]) == 2
     emps = ["emps" if a == "ant" else a for a in COMMAND]
     assert run(emps) == 2
-    assert "no controllers are known" in capsys.readouterr().err
+    assert "no built-in controllers" in capsys.readouterr().err

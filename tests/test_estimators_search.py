@@ -181,7 +181,7 @@ def test_names_give_their_estimators() -> None:
         ("lqs", "Did you mean 'lsq'"),
         ("cma-es", "Did you mean 'cmaes'"),
         ("annealing", "There are lsq, ga, cmaes, nlopt:LN_BOBYQA"),
-        ("lsq:fast", "takes nothing after a colon"),
+        ("lsq:fast", "takes no setting after a colon"),
         ("nlopt:CMAES", r"no CMA-ES.*'cmaes', 'nlopt:GN_CRS2_LM', 'nlopt:GN_ISRES', 'nlopt:GN_ESCH'"),
         ("nlopt:cma", "no CMA-ES"),
         ("nlopt:LN_BOBQA", "Did you mean LN_BOBYQA"),

@@ -71,7 +71,7 @@ def test_all_mistakes_are_told_at_once() -> None:
 
 def test_a_prior_without_anything_in_the_bounds_is_refused() -> None:
     below = Parameter("constant_force:j", "Nm", 0.0, -2.0, -1.0, 0.1)
-    with pytest.raises(UsageError, match="nothing within -2 to -1"):
+    with pytest.raises(UsageError, match="no mass within -2 to -1"):
         choose_priors((below,), {"constant_force": "lognormal(1, 1)"})
 
 

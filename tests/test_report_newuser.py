@@ -147,12 +147,12 @@ def test_bounds_of_fields_and_parameters_that_exist_are_taken(cli: Cli) -> None:
 
 
 def test_a_file_that_is_no_result_and_a_run_that_has_not_ended_are_told_apart(cli: Cli, tmp_path: Path) -> None:
-    assert "is no result" in cli("report", RECORDED).err
+    assert "is not a result" in cli("report", RECORDED).err
     assert "give the --out folder of a finished run" in cli("report", tmp_path).err
     (tmp_path / "journal.jsonl").touch()
     answer = cli("report", tmp_path)
     assert answer.code == 2
-    assert "--resume goes on" in answer.err
+    assert "repeat its command with --resume" in answer.err
 
 
 def test_a_warning_says_what_to_do(cli: Cli, tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_all_problems_are_told_at_once() -> None:
     with pytest.raises(UsageError) as caught:
         parse_parameters(["mass:toe", "kp:*", "nonsense:*", "kp:knee"], LEG)
     message = str(caught.value)
-    assert all(part in message for part in ("'toe'", "'nonsense'", "kp:knee is already freed by 'kp:*'"))
+    assert all(part in message for part in ("'toe'", "'nonsense'", "kp:knee is already declared by 'kp:*'"))
 
 
 PLACES = st.lists(st.sampled_from(["hip", "knee", "ankle", "*", "k*"]), min_size=1, max_size=3).map(",".join)
@@ -85,7 +85,7 @@ def test_no_number_is_ever_freed_twice(expressions: list[str]) -> None:
     try:
         terms = parse_parameters(expressions, LEG)
     except UsageError as error:
-        assert "already freed" in str(error)  # noqa: PT017 - a success is checked below
+        assert "already declared" in str(error)  # noqa: PT017 - a success is checked below
         return
     freed = [(m.name, place) for m in terms for place in m.places]
     assert len(freed) == len(set(freed))

@@ -95,5 +95,5 @@ def get_choice(name: str) -> Choice:
         Listing what there is.
     """
     if name not in CHOICES:
-        raise UsageError(f"unknown choice of trials {name!r}; there are {', '.join(CHOICES)}")
+        raise UsageError(f"unknown choice of trials {name!r}; available: {', '.join(CHOICES)}")
     return CHOICES[name]

@@ -107,7 +107,7 @@ def _look(
     logs = early_logs(stage, tried, LOGS)
     logs = logs[len(logs) % 2 :]  # as many fitted as held out
     if len(logs) < FEWEST:
-        message = "fewer than two trials with a log of their first seconds: nothing can be looked for"
+        message = "missing effects were not searched for: fewer than two trials have a log of their first seconds"
         return Joined(message), None
     declared = Model.of(stage.world.terms, values)
     drives = [term for term in declared.terms if term.scope != "body"] or list(declared.terms)
@@ -118,7 +118,10 @@ def _look(
         now = judge(study, free)
         error = float(np.sqrt(max(now.train, now.holdout)))
         if error <= EXPLAINED:
-            message = f"nothing is looked for: the trials begin as the model foresees within {error:.2g} noise floors"
+            message = (
+                "missing effects were not searched for: the model predicts the beginning of the trials within "
+                f"{error:.2g} noise floors"
+            )
             return Joined(message, simulations=now.evaluations * len(logs)), None
         closing = close(
             study,
@@ -129,16 +132,17 @@ def _look(
             progress=progress,
         )
     except SysidError as error:
-        return Joined(f"missing effects could not be looked for: {error}"), None
+        return Joined(f"missing effects could not be searched for: {error}"), None
     first, last = closing.steps[0].holdout, closing.steps[-1].holdout
     spent = closing.replays * len(logs)
     if len(closing.model.terms) == len(free.terms) or last > LEFT * first:
-        return Joined(f"no effect is worth adding; {_score(first, last)}", simulations=spent), None
+        message = f"no effect improves the prediction enough to be added; {_score(first, last)}"
+        return Joined(message, simulations=spent), None
     found, last, apart = _tell_apart(study, closing.model, len(free.terms), last)
     joining, spent = found.without(*free.terms), spent + apart * len(logs)
     fitted = [(term, found.own(term) if term in found.terms else own) for term, own in declared.parts]
     told = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
-    message = f"joined the model: {told}; {_score(first, last)}"
+    message = f"added to the model: {told}; {_score(first, last)}"
     return Joined(message, Model.joined([*fitted, *joining.parts]), spent), study
 
 

@@ -191,7 +191,7 @@ def get_space(robot: str) -> ControllerSpace:
     """
     if robot not in SPACES:
         raise UsageError(
-            f"model {robot}: no controllers are known for it; there are some for {', '.join(SPACES)}. From Python, "
-            "give any space of controllers to sysid_btr.btr.loop.back_to_reality"
+            f"model {robot}: there are no built-in controllers for it, only for {', '.join(SPACES)}. From Python, "
+            "pass any controller space to sysid_btr.btr.loop.back_to_reality"
         )
     return SPACES[robot]()

@@ -94,12 +94,12 @@ class FolderExchange:
                 Folder(place).write(PROBLEMS, "\n".join(problems) + "\n")
                 self.say(f"{place}: the reply cannot be used:\n  " + "\n  ".join(problems))
             if not told:
-                self.say(f"play {place / COMMAND}, then put {RECORDED} and, last, {REPLY} beside it")
+                self.say(f"execute {place / COMMAND}, then put {RECORDED} and, last, {REPLY} next to it")
                 told = True
             if self.patience is not None and time.monotonic() - began >= self.patience:
                 raise InterruptedRun(
                     f"{place}: no usable reply after {self.patience:g} s; everything is kept, and the same command "
-                    "with --resume goes on waiting"
+                    "with --resume continues to wait"
                 )
             time.sleep(self.poll)
 
@@ -121,7 +121,7 @@ class FolderExchange:
                 raise UsageError(f"{request} cannot be read ({error}); restore it or clear --exchange") from None
             if there != content:
                 raise UsageError(
-                    f"{request} asks for another trial than this run does: it belongs to another run. Give another "
+                    f"{request} is for another trial than this run's: it belongs to another run. Give another "
                     "--exchange folder, or --resume the run that it belongs to"
                 )
             return

@@ -89,7 +89,7 @@ def back_to_reality(
         If the folder holds another run's work.
     """
     if not terms:
-        raise UsageError("nothing of the model is unknown: name what the trials may correct (--fit)")
+        raise UsageError("no parameter is declared: name what the trials may correct (--fit)")
     settings = Settings() if settings is None else settings
     loop = _Loop(model, robot, space, task, settings, seed, folder, threads, progress, say, tuple(terms), fingerprint)
     return loop.go()
@@ -260,7 +260,7 @@ class _Loop:
         noted = _noted(self.progress, f"iteration {number}, {step}")
         found = estimator.fit(problem, rng=rng, budget=Budget(), journal=journal, progress=noted)
         if found.termination is Termination.INTERRUPTED:
-            raise InterruptedRun(f"interrupted in iteration {number}, {step}; what is done is kept")
+            raise InterruptedRun(f"interrupted in iteration {number}, {step}; finished work is kept")
         self.simulations += round(found.evaluations * problem.runs)
         return found, journal
 
@@ -340,16 +340,16 @@ def disengaged(rounds: Sequence[Iteration]) -> str:
     if not tried and rounds[-1].tried:
         return f"Disengaged: every trial of the last {PATIENCE} iterations crashed."
     if not tried:
-        return f"Disengaged: the last {PATIENCE} iterations found no controller that was not tried before."
+        return f"Disengaged: the last {PATIENCE} iterations found no controller that had not been tried before."
     if len(tried) < 2 * PATIENCE or np.ptp(real) == 0:
         return ""
     told = _rank_correlation(expected, real)
     if told > UNTOLD:
         return ""
     return (
-        f"Disengaged: nothing better was found on the robot in {PATIENCE} iterations, and the model does not tell "
-        f"which controller is better there (rank correlation {told:.2f} over {len(tried)} trials). The model lacks "
-        "something that the robot has: free other parameters, or let missing effects be looked for (--close)."
+        f"Disengaged: nothing better was found on the robot in {PATIENCE} iterations, and the model does not "
+        f"predict which controller is better there (rank correlation {told:.2f} over {len(tried)} trials). The model "
+        "lacks something that the robot has: declare other parameters, or search for missing effects (--close)."
     )
 
 

@@ -142,7 +142,7 @@ class BackToReality:
                     "controllers": repr(self.settings.controllers),
                     "models": repr(self.settings.models),
                 },
-                "intervals": "linearised fitness of the newest trials, widened by the step to the optimum that is left",
+                "intervals": "linearised fitness of the newest trials, widened by the remaining step to the optimum",
                 "units": {"fitness": "m/s"},
                 "numerics": {
                     "integrator": world.numerics.integrator,
@@ -231,7 +231,7 @@ def _message(outcome: BackToReality) -> str:
     return (
         f"{best.trial.fitness:.4g} m/s on the robot (trial {best.controller.label}; {started:.4g} in the first "
         f"iteration) after {len(outcome.tried)} trials{f', {fell} of which fell or crashed' if fell else ''}; the "
-        f"model foresees fitness within {outcome.iterations[-1].transfer:.2g} m/s, {first.transfer:.2g} at first. "
+        f"model predicts fitness within {outcome.iterations[-1].transfer:.2g} m/s, {first.transfer:.2g} at first. "
         f"{outcome.reason}"
     )
 

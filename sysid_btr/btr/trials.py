@@ -97,11 +97,11 @@ class TrialBook:
             values = np.array(content["controller"], dtype=np.float64)
             fitness, outcome, logged = float(content["fitness"]), content["outcome"], bool(content["logged"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UsageError(f"{entry} cannot be read ({error!r}); restore it, or begin anew (--overwrite)") from None
+            raise UsageError(f"{entry} cannot be read ({error!r}); restore it, or start over (--overwrite)") from None
         if values.tobytes() != controller.values.tobytes() or outcome not in OUTCOMES:
             raise UsageError(
-                f"{entry} is of another controller than this run tries: the seed, the settings or a library version "
-                "differ from the run that wrote it. Resume with the same ones, or begin anew (--overwrite)"
+                f"{entry} is of another controller than this run's: the seed, the settings or a library version "
+                "differ from the run that wrote it. Resume with the same ones, or start over (--overwrite)"
             )
         return Trial(read_log(path, check=False) if logged else None, fitness, outcome)
 

@@ -43,7 +43,7 @@ class World(Replay):
         free = free_joints(model)
         if len(free) != 1:
             raise ModelError(
-                f"model {self.robot.name}: {len(free)} free joints; a robot that walks has one, at its base"
+                f"model {self.robot.name}: {len(free)} free joints; a walking robot has one, at its base"
             )
         joint = int(free[0])
         return replace(make_index(model), base=(int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])))

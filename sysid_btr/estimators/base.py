@@ -74,9 +74,9 @@ class Budget:
 
     def __post_init__(self) -> None:
         if self.evaluations is not None and self.evaluations < 1:
-            raise UsageError(f"a budget of {self.evaluations} evaluations buys nothing: give at least 1")
+            raise UsageError(f"a budget of {self.evaluations} evaluations is too small: give at least 1")
         if self.seconds is not None and not self.seconds > 0.0:
-            raise UsageError(f"a budget of {self.seconds} s buys nothing: give a positive time")
+            raise UsageError(f"a budget of {self.seconds} s is too small: give a positive time")
 
 
 class Progress(Protocol):
@@ -101,14 +101,14 @@ class Termination(Enum):
     )
     ITERATION_LIMIT = (
         "The iteration limit was reached while the loss was still falling: raise the limit, "
-        "or begin from a better start."
+        "or start from better values."
     )
     INTERRUPTED = "Interrupted: the best parameters so far are returned, and the journal can be resumed."
     STALLED = (
-        "Stalled: the derivatives promise a lower loss but no step finds one. The loss is rough near this "
-        "point: smooth it (shorter windows, softer contacts) or use an estimator without derivatives."
+        "Stalled: the derivatives predict a lower loss but no step finds one. The loss is rough near this "
+        "point: smooth it (shorter segments, softer contacts) or use an estimator without derivatives."
     )
-    GAVE_UP = "The search gave up before it converged: begin from a better start, or use another estimator."
+    GAVE_UP = "The search gave up before it converged: start from better values, or use another estimator."
     NO_FINITE_CANDIDATE = (
         "No candidate could be simulated to a finite loss: check the model and the log at the start values, "
         "or narrow the bounds."

@@ -190,8 +190,8 @@ class Journal:
                 self._drop_older_attachments(number)
         except OSError as error:
             raise UsageError(
-                f"{self._label} cannot be written: {error.strerror or 'no room is left'}. What was done before is kept "
-                "in it: make room or give leave to write there, and go on with --resume"
+                f"{self._label} cannot be written: {error.strerror or 'no space is left'}. Earlier work is kept in "
+                "it: free some space or grant write permission, and continue with --resume"
             ) from error
         self._tape.records.append(record)
         self._tape.cursor = len(self._tape.records)
@@ -213,7 +213,7 @@ class Journal:
         except (OSError, ValueError) as error:
             raise UsageError(
                 f"{self._label}: the array that belongs to record {number + 1} cannot be read ({error}). "
-                "Begin anew with another journal (--overwrite)"
+                "Start over with another journal (--overwrite)"
             ) from None
         return values
 
@@ -283,7 +283,7 @@ class Journal:
                     break  # the last record, cut short and closed by blocks the disk never wrote
                 raise UsageError(
                     f"{path}, line {i}: damaged, and later records depend on it. "
-                    "Restore the file, or begin anew with another journal (--overwrite)"
+                    "Restore the file, or start over with another journal (--overwrite)"
                 ) from None
             good += len(line) + 1
         if good < len(data):
@@ -301,7 +301,7 @@ class Journal:
             raise UsageError(
                 f"journal {path} belongs to another fit (its fingerprint is {fingerprint!r}, this fit's is "
                 f"{self.fingerprint!r}): resume with the model, logs, parameters, estimator and seed it "
-                "was written with, or begin anew (--overwrite)"
+                "was written with, or start over (--overwrite)"
             )
 
     @staticmethod

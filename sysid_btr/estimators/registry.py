@@ -63,7 +63,7 @@ def get_estimator(name: str, **settings: Any) -> Estimator:
     if factory is None:
         raise UsageError(_unknown(name))
     if colon and stem in BUILT_IN and stem not in _WITH_ARGUMENT:
-        raise UsageError(f"estimator {stem!r} takes nothing after a colon: write {stem!r}, not {name!r}")
+        raise UsageError(f"estimator {stem!r} takes no setting after a colon: write {stem!r}, not {name!r}")
     _check_settings(stem, factory, settings)
     estimator: Estimator = factory(argument, **settings) if colon else factory(**settings)
     return estimator
@@ -72,7 +72,7 @@ def get_estimator(name: str, **settings: Any) -> Estimator:
 def _chain(name: str, settings: Mapping[str, Any]) -> Estimator:
     stems = name.split("+")
     if not all(stems):
-        raise UsageError(f"{name!r} is no chain of estimators: join their names, as in 'cmaes+lsq'")
+        raise UsageError(f"{name!r} is not a chain of estimators: join their names, as in 'cmaes+lsq'")
     wanted = {key: value for key, value in settings.items() if key != "stages"}
     _check_settings(name, Chain, wanted)
     return Chain(tuple(get_estimator(stem) for stem in stems), **wanted)

@@ -41,7 +41,7 @@ def finite_near(evaluator: Evaluator, u: FloatArray, rng: Generator) -> tuple[Fl
     """The best finite point of the widest neighbourhood of `u`, in the unit cube, that has one."""
     for reach in _REACHES:
         near = u + reach * (latin_hypercube(rng, _POINTS, len(u)) - u)
-        losses = evaluator.loss(evaluator.box.leave(near), "looking for a start that can be simulated")
+        losses = evaluator.loss(evaluator.box.leave(near), "searching for a start that can be simulated")
         i = int(np.argmin(losses))
         if np.isfinite(losses[i]):
             return near[i], float(losses[i])

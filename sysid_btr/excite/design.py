@@ -103,13 +103,13 @@ def find_sensors(robot: Robot, reference: Log | None = None, noise: float | None
     from sysid_btr.models.robot import joint_names
 
     if noise is not None and not (np.isfinite(noise) and noise > 0):
-        raise UsageError(f"--noise {noise:g}: the standard deviation of a position sensor is positive")
+        raise UsageError(f"--noise {noise:g}: the standard deviation of a position sensor must be positive")
     joints = joint_names(robot)
     if reference is None:
         if noise is None and any(slides(robot.compile(), j) for j in joints):
             raise UsageError(
-                f"model {robot.name} has sliding joints, and what noise their sensors have cannot be guessed: give "
-                "--log, or --noise in m"
+                f"model {robot.name} has sliding joints, and the noise of their sensors is unknown: give --log, or "
+                "--noise in m"
             )
         said = "as given" if noise is not None else "of a 12-bit encoder, assumed"
         return Sensors({("position", j): ENCODER if noise is None else noise for j in joints}, said)
@@ -202,7 +202,7 @@ def find_criterion(name: str) -> Criterion:
         Listing what there is.
     """
     if name not in CRITERIA:
-        raise UsageError(f"unknown criterion {name!r}; there are {', '.join(CRITERIA)}")
+        raise UsageError(f"unknown criterion {name!r}; available: {', '.join(CRITERIA)}")
     return CRITERIA[name]
 
 
@@ -419,7 +419,7 @@ def design(
     Raises
     ------
     UsageError
-        What is asked cannot be used, or the reference log is of a robot that was free to move.
+        What is asked cannot be used, or the reference log is a floating-base log.
     ModelError
         The model has no servo, or diverges.
     """
@@ -470,7 +470,7 @@ def configured(robot: Robot, reference: Log | None) -> Robot:
     Raises
     ------
     UsageError
-        If it has none but needs them, or the log is of a robot that was free to move.
+        If it has none but needs them, or the log is a floating-base log.
     """
     if reference is None:
         if robot.configure is not None:
@@ -478,8 +478,8 @@ def configured(robot: Robot, reference: Log | None) -> Robot:
         return robot
     if reference.meta.mount == "free":
         raise UsageError(
-            f"{reference.path or 'the reference log'} is of a robot that was free to move; motions are designed "
-            "for a robot whose torso is held: give a log of that, or none and --noise"
+            f"{reference.path or 'the reference log'} is a floating-base log; motions are designed for a fixed "
+            "base: give a fixed-base log, or none and --noise"
         )
     return robot.for_log(reference)
 

@@ -95,7 +95,7 @@ class Clock:
             If it is too short to rise from rest and fall back, or sampled too slowly for what moves in it.
         """
         if not 2.5 * RAMP <= seconds <= 3600:
-            raise UsageError(f"--seconds {seconds:g}: a motion lasts {2.5 * RAMP:g} to 3600 s")
+            raise UsageError(f"--seconds {seconds:g}: a motion must last {2.5 * RAMP:g} to 3600 s")
         if not 4 * FASTEST <= rate <= 10_000:
             raise UsageError(
                 f"--rate {rate:g}: a motion of up to {FASTEST:g} Hz is sampled at {4 * FASTEST:g} to 10000 Hz"
@@ -261,7 +261,7 @@ def find_motors(
     model = robot.compile()
     known = servo_joints(robot)
     if not known:
-        raise ModelError(f"model {robot.name} has no position servo, so there is nothing to command")
+        raise ModelError(f"model {robot.name} has no position servo, so no joint can be commanded")
     chosen = _chosen(known, joints)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -299,7 +299,7 @@ def _chosen(known: Sequence[str], globs: Sequence[str]) -> list[str]:
         return list(known)
     wrong = [glob for glob in globs if not any(fnmatchcase(name, glob) for name in known)]
     if wrong:
-        raise UsageError(f"--joints {', '.join(wrong)}: no such joint with a servo; there are {', '.join(known)}")
+        raise UsageError(f"--joints {', '.join(wrong)}: not joints with a servo; available: {', '.join(known)}")
     return [name for name in known if any(fnmatchcase(name, glob) for glob in globs)]
 
 

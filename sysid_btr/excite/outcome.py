@@ -27,7 +27,7 @@ MOTION, FIGURE = "excite.parquet", "excite"
 MOTORS_SHOWN = 6
 WARNING = (
     "Only the limits of the joints keep this motion from hitting the robot itself or the ground: replay it in a viewer "
-    "first, and play it on the robot slowly at first."
+    "first, and execute it slowly at first."
 )
 
 

@@ -101,7 +101,7 @@ def _client(distributed: Any, place: str, count: int | None) -> Iterator[Any]:
     except (OSError, TimeoutError, ValueError) as error:
         raise UsageError(
             f"--executor {place}: no dask scheduler answers there. Start one (dask scheduler), then workers on every "
-            f"machine (dask worker {place} --nworkers auto --nthreads 1), and see that the port is open"
+            f"machine (dask worker {place} --nworkers auto --nthreads 1), and check that the port is open"
         ) from error
     with client:
         yield client

@@ -222,8 +222,8 @@ class DaskExecutor:
                     pass
             time.sleep(TICK)
         raise LostCluster(
-            f"the scheduler {self._address} has not answered for {self._patience:g} s; start it and its workers again, "
-            "or go on elsewhere (--executor local, or without)"
+            f"the scheduler {self._address} has not answered for {self._patience:g} s; restart it and its workers, or "
+            "continue elsewhere (--executor local, or without)"
         )
 
     def count(self, done: Done) -> None:
@@ -320,15 +320,15 @@ class _Batch:
             return
         except KilledWorker as error:
             raise LostCluster(
-                "several workers died while they simulated the same candidates; look whether they have enough memory "
-                "(dask worker --memory-limit), and what their own logs say"
+                "several workers died while they simulated the same candidates; check that they have enough memory "
+                "(dask worker --memory-limit), and read their logs"
             ) from error
         except CancelledError as error:
             raise Lost from error
         except ModuleNotFoundError as error:
             raise ModelError(
-                f"a worker lacks the package {error.name!r}: install sysid-btr, and what its plug-ins need, on every "
-                "machine of the cluster"
+                f"a worker lacks the package {error.name!r}: install sysid-btr and the packages of its plug-ins on "
+                "every machine of the cluster"
             ) from error
         if i not in self.done:
             self.done[i] = found.rows

@@ -107,7 +107,7 @@ def _settle(worker: Any, wanted: Mapping[str, str]) -> Shelf:
     differ = [f"{name} {own[name]} instead of {v}" for name, v in wanted.items() if own[name] != v]
     if differ:
         raise ModelError(
-            f"worker {worker.address} has {', '.join(differ)}: its numbers would not be the same. Install the same "
+            f"worker {worker.address} has {', '.join(differ)}: its results would differ. Install the same "
             "versions on all machines"
         )
     silence()

@@ -237,11 +237,11 @@ def lowest_points(model: mujoco.MjModel, feet: Sequence[Foot], base: BaseState) 
 
 def _feet(model: mujoco.MjModel) -> tuple[Foot, ...]:
     if base_body(model) < 0:
-        raise ModelError("the log says that its base was free, and the model has no free joint: give the free model")
+        raise ModelError("the log is a floating-base log, and the model has no free joint: give one that has")
     feet = touching_bodies(model)
     if not feet:
         raise ModelError(
-            "the log says that its base was free, and nothing of the model can touch the ground: give the model a "
+            "the log is a floating-base log, and nothing of the model can touch the ground: give the model a "
             "floor, and contacts (contype, conaffinity) between it and the feet"
         )
     return feet
@@ -258,7 +258,7 @@ def imu_columns(log: Log, names: tuple[str, ...]) -> FloatArray:
     missing = [f"imu.{n}" for n in names if not log.has("imu", n)]
     if missing:
         raise LogError(
-            f"log {log.path or ''}: its base was free, and {', '.join(missing)} is missing: the orientation of the "
+            f"log {log.path or ''}: a floating-base log without {', '.join(missing)}: the orientation of the "
             "base needs imu.gyro_x..z, and imu.angle_x, imu.angle_y or imu.acc_x..z"
         )
     values = log.array("imu", names)
@@ -266,7 +266,7 @@ def imu_columns(log: Log, names: tuple[str, ...]) -> FloatArray:
     for column in values.T:
         good = np.isfinite(column)
         if not good.any():
-            raise LogError(f"log {log.path or ''}: a column of the IMU has no value")
+            raise LogError(f"log {log.path or ''}: a column of the IMU has no values")
         column[~good] = np.interp(index[~good], index[good], column[good])
     return values
 
@@ -279,7 +279,7 @@ def vertical(log: Log, gyro: FloatArray, lost: list[str]) -> tuple[FloatArray, F
         return up_in_base(angles[:, 0], angles[:, 1]), np.full(len(angles), max(sigma, 1e-4))
     force = imu_columns(log, ("acc_x", "acc_y", "acc_z"))
     size = np.linalg.norm(force, axis=1)
-    lost.append("no inclinometer: the vertical is the accelerometer's, less sure while the robot accelerates")
+    lost.append("no inclinometer: the vertical is the accelerometer's, more uncertain while the robot accelerates")
     return force / size[:, None], TILT_STD + np.abs(size - GRAVITY) / GRAVITY + 0.05
 
 
@@ -289,7 +289,7 @@ def foot_loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list
     if not any(columns):
         lost.append(
             "no force sensors under the feet: a foot stands where it is the lowest; pick-ups and slips are not found, "
-            "and moments at which both feet are near the ground are less sure"
+            "and the uncertainty is larger while both feet are near the ground"
         )
         return None
     return np.stack(

@@ -54,7 +54,7 @@ def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = s
     parameters = fit.model.terms.parameters
     names = [p.name for p in parameters]
     if name not in names:
-        raise UsageError(f"--profile {name} is not a free parameter; there are {', '.join(names)}")
+        raise UsageError(f"--profile {name} is not a fitted parameter; available: {', '.join(names)}")
     problem = fit.study.train_problem(fit.model)
     index = names.index(name)
     return profile_curve(
@@ -85,7 +85,7 @@ def chosen_names(names: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]
     """
     missing = [w for w in wanted if not any(n == w or fnmatchcase(n, w) for n in names)]
     if missing:
-        raise UsageError(f"--profile {', '.join(missing)}: no free parameter; there are {', '.join(names)}")
+        raise UsageError(f"--profile {', '.join(missing)}: not a fitted parameter; available: {', '.join(names)}")
     return tuple(n for n in names if any(n == w or fnmatchcase(n, w) for w in wanted))
 
 
@@ -118,7 +118,7 @@ def profile_curve(
     top = _fit(estimator, problem, progress)
     jacobian, residual = top.jacobian, top.residual
     if jacobian is None or residual is None:
-        raise UsageError("there is no profile where least squares do not settle: fit the parameters first")
+        raise UsageError("no profile without converged least squares: fit the parameters first")
     jacobian = np.nan_to_num(jacobian)
     normal = jacobian.T @ jacobian
     span = float(problem.upper[index] - problem.lower[index])

@@ -129,7 +129,7 @@ def leg_angles(x: FloatArray, y: FloatArray, z: FloatArray) -> dict[str, FloatAr
     reach = np.hypot(x, down)
     if np.any(reach >= upper + SHANK) or np.any(reach <= upper - SHANK):
         raise UsageError(
-            f"gait: the feet would be {reach.min():.3f} to {reach.max():.3f} m from the hips, and a leg reaches "
+            f"gait: the feet would be {reach.min():.3f} to {reach.max():.3f} m from the hips, but a leg reaches "
             f"{upper + SHANK:.3f} m: take shorter steps, sway less or crouch more"
         )
     knee = np.pi - skew - np.arccos((upper**2 + SHANK**2 - reach**2) / (2 * upper * SHANK))

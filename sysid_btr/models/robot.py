@@ -93,8 +93,8 @@ def robot_from_file(path: Path) -> Robot:
         raise ModelError(f"model {path} cannot be read: {error.strerror}; check the file's permissions") from error
     if not content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
         raise ModelError(
-            f"model {path}: this is no XML file, so it is neither MJCF nor URDF. Give the robot's model with --model, "
-            "and a log with --log"
+            f"model {path}: this is not an XML file, so it is neither MJCF nor URDF. Give the robot's model with "
+            "--model, and a log with --log"
         )
     try:
         make_spec().compile()

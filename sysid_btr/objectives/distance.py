@@ -249,7 +249,7 @@ def get_distance(name: str) -> Distance | None:
     if base == "phi2" and (not bins or bins.isdigit()):
         return Phi2(int(bins)) if bins else Phi2()
     raise UsageError(
-        f"unknown distance {name!r}; there are likelihood, {', '.join(_PLAIN)}, phi2 and phi2:BINS (such as phi2:20)"
+        f"unknown distance {name!r}; available: likelihood, {', '.join(_PLAIN)}, phi2 and phi2:BINS (such as phi2:20)"
     )
 
 

@@ -111,8 +111,8 @@ def _make_targets(
         )
     if not targets and log.is_motion:
         raise ModelError(
-            f"log {log.path or ''} is a motion to be played, not a recording: it has commands alone, and nothing to "
-            "compare a replay with. Give the log of what the sensors said when it was played."
+            f"log {log.path or ''} is an excitation trajectory, not a recording: it has only commands, and nothing to "
+            "compare a replay with. Give the log that was recorded while the robot executed it."
         )
     if not targets:
         have = ", ".join(log.joints("position")) or "none"

@@ -96,7 +96,7 @@ def parse_prior(text: str) -> Prior:
     match = re.fullmatch(r"\s*(\w+)\s*(?:\(([^()]*)\))?\s*", text)
     kind = match.group(1).lower() if match else ""
     if match is None or kind not in KINDS:
-        raise UsageError(f"{text!r} is no prior; there are {_FORMS}")
+        raise UsageError(f"{text!r} is not a prior; priors are {_FORMS}")
     given = [a for a in (match.group(2) or "").split(",") if a.strip()]
     try:
         numbers = [float(a) for a in given]
@@ -122,7 +122,7 @@ def choose_priors(
     Raises
     ------
     UsageError
-        A key matches nothing, a text is no prior, or a prior leaves nothing within the bounds; all at once.
+        A key matches nothing, a text is not a prior, or a prior leaves nothing within the bounds; all at once.
     """
     problems = []
     parsed: dict[str, Prior] = {}
@@ -133,13 +133,13 @@ def choose_priors(
             problems.append(f"{key}: {error}")
         if not any(_rank(key, p.name) for p in parameters):
             names = ", ".join(p.name for p in parameters)
-            problems.append(f"{key} is not a free parameter; there are {names}")
+            problems.append(f"{key} is not a fitted parameter; available: {names}")
     own = {key: parse_prior(text) for key, text in (table or {}).items()}
     chosen: list[Prior] = []
     for parameter in parameters:
         prior = _closest(parsed, parameter.name) or _closest(own, parameter.name) or Uniform()
         if not np.isfinite(_on_grid(prior, parameter.lower, parameter.upper)[1]).any():
-            problems.append(f"{parameter.name}: {prior} has nothing within {parameter.lower:g} to {parameter.upper:g}")
+            problems.append(f"{parameter.name}: {prior} has no mass within {parameter.lower:g} to {parameter.upper:g}")
         chosen.append(prior)
     if problems:
         raise UsageError("priors that cannot be used:\n  " + "\n  ".join(problems))
@@ -185,4 +185,4 @@ def _on_grid(prior: Prior, lower: float, upper: float) -> tuple[FloatArray, Floa
 
 def _check(good: bool, prior: Prior) -> None:
     if not good:
-        raise UsageError(f"{prior} is no prior: means and medians must be finite, spreads positive")
+        raise UsageError(f"{prior} is not a prior: means and medians must be finite, spreads positive")

@@ -42,12 +42,12 @@ _REACHES = (1.0, 0.3, 0.1, 0.03, 0.01)
 _MESSAGES = {
     Termination.CONVERGED: "Converged: the ensembles agree, and each is long against its autocorrelation.",
     Termination.BUDGET_SPENT: (
-        "The budget was spent before the posterior converged: its draws are written, and are not to be relied "
-        "on. Resume with a larger --max-evaluations."
+        "The budget was spent before the posterior converged: its draws are written, but are not reliable. Resume "
+        "with a larger --max-evaluations."
     ),
     Termination.ITERATION_LIMIT: (
-        "The posterior had not converged when the limit of steps was reached: its draws are written, and are "
-        "not to be relied on."
+        "The posterior had not converged when the limit of steps was reached: its draws are written, but are not "
+        "reliable."
     ),
     Termination.INTERRUPTED: "Interrupted: the draws so far are returned, and the journal can be resumed.",
 }
@@ -237,10 +237,10 @@ def sample(
     done = min((run.steps for run in runs), default=0) if len(runs) == settings.ensembles else 0
     if done < 2:
         raise NotConvergedError(
-            f"sampling ended after {outcome.evaluations} replays, before there was a draw: "
+            f"sampling ended after {outcome.evaluations} replays, before the first draw: "
             f"{settings.ensembles} ensembles of {walkers} walkers need "
             f"{settings.ensembles * walkers} replays a step, and at least {settings.fewest_steps} steps: "
-            "raise --max-evaluations, or go on with --resume"
+            "raise --max-evaluations, or continue with --resume"
         )
     return _collect(problem.names, runs, likelihood, outcome.termination, outcome.evaluations, outcome.seconds)
 

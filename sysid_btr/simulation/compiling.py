@@ -24,7 +24,7 @@ LIFT = 1.0
 
 def made_elsewhere() -> mujoco.MjSpec:
     """In the place of a model's source, where only the compiled model was sent."""
-    raise ModelError("this model was compiled in another process, and cannot be compiled anew here")
+    raise ModelError("this model was compiled in another process, and cannot be compiled again here")
 
 
 def compile_model(

@@ -26,5 +26,5 @@ class Numerics:
         return max(round(self.servo_period / self.timestep), 1) if self.servo_period else 0
 
     def __str__(self) -> str:
-        held = f", servo torque held for {1e3 * self.servo_period:g} ms" if self.servo_period else ""
+        held = f", servo torque updated every {1e3 * self.servo_period:g} ms" if self.servo_period else ""
         return f"{self.integrator} {1e3 * self.timestep:g} ms{held}"

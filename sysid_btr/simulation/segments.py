@@ -146,7 +146,7 @@ class WindowReplay(Replay):
     @cached_property
     def _windows(self) -> Windows:
         if self.windows is None:
-            raise ValueError("a replay by windows needs windows")
+            raise ValueError("a segmented replay needs segments")
         return self.windows
 
     @cached_property

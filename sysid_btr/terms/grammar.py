@@ -63,7 +63,7 @@ def parse_parameters(
                 for place in term.places:
                     key = f"{term.name}:{place}"
                     if key in taken:
-                        raise UsageError(f"{key} is already freed by {taken[key]!r}")
+                        raise UsageError(f"{key} is already declared by {taken[key]!r}")
                     taken[key] = expression
                 result.append(term)
         except UsageError as error:

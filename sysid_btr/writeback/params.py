@@ -58,7 +58,7 @@ def read_params(path: Path, robot: Robot) -> Params:
     except ValueError as error:
         raise UsageError(f"--params {file} is not JSON ({error}); give the params.json of a finished run") from error
     if not isinstance(content, dict) or content.get("schema") != PARAMS_SCHEMA:
-        raise UsageError(f"--params {file} is no parameter file ({PARAMS_SCHEMA}); give the params.json of a run")
+        raise UsageError(f"--params {file} is not a parameter file ({PARAMS_SCHEMA}); give the params.json of a run")
     problems: list[str] = []
     parts: list[tuple[Term, list[float]]] = []
     try:
@@ -101,7 +101,7 @@ def _term(
         kinds = ", ".join(k.name for k in bare.kinds)
         problems.append(
             f"{name} at {', '.join(where)}: {len(known)} numbers, where this version has {len(bare.parameters)} "
-            f"({kinds} each); another version wrote the file, identify again with this one"
+            f"({kinds} each); the file is of another version: identify again with this one"
         )
         return None
     return replace(bare, known=known)

@@ -89,7 +89,7 @@ class Compiled:
         element = self.elements[kind][i]
         if element is None:
             name = getattr(self.model, kind)(i).name
-            raise CannotWriteError(f"{kind} {name or i} is no single element of the text")
+            raise CannotWriteError(f"{kind} {name or i} is not a single element of the text")
         return element
 
 

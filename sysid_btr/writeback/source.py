@@ -79,18 +79,18 @@ def own_source(path: Path) -> Source:
     Raises
     ------
     ValueError
-        If it is no MJCF, such as a URDF.
+        If it is not MJCF, such as a URDF.
     """
     text = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
     if parse(text).tag != "mujoco":
-        raise ValueError(f"{path} is no MJCF")
+        raise ValueError(f"{path} is not MJCF")
     found: list[Included] = []
     text = _expand(text, path.parent, path.parent, found)
     return Source(absolute_assets(text, path.parent.resolve()), str(path), tuple(found))
 
 
 def made_source(robot: Robot, why: str = "") -> Source:
-    """A complete MJCF of a robot that is no MJCF file: built in, made in Python, or read from a URDF."""
+    """A complete MJCF of a robot without an MJCF file: built in, made in Python, or read from a URDF."""
     spec = robot.make_spec()
     spec.compile()
     text = LONG_NUMBER.sub(lambda m: number(float(m[0])), precise_xml(spec)).encode()

@@ -144,7 +144,7 @@ def draft(model: Identified) -> Draft:
         try:
             return _draft_in(own_source(robot.path), model, robot, target)
         except (ValueError, OSError) as error:
-            why = f", written anew and without its comments because {error}"
+            why = f", rewritten without its comments because {error}"
     try:
         return _draft_in(made_source(robot, why), model, robot, target)
     except CannotWriteError as error:
@@ -202,9 +202,9 @@ def _header(draft: Draft, costs: Sequence[str]) -> list[str]:
         f"<option> has the integrator and the step of the replay ({study.numerics}); with others it moves differently.",
     ]
     if not draft.source.own:
-        lines.append("It is a complete file of its own: there was no MJCF to change.")
+        lines.append("It is a complete file: there was no MJCF to change.")
     if any(episode.log.meta.mount == "fixed" for episode in study.train) and _floats(draft):
-        lines.append("In the log the robot was held; to replay it, take the free joint away.")
+        lines.append("The log is of a fixed base; to replay it, remove the free joint.")
     delayed = [p for p in draft.target.parts if p.stand_in is not None and p.stand_in.name == "delay"]
     if delayed:
         lines.append("Commands are delayed: fill the buffers with the first command (mj_initCtrlHistory).")
