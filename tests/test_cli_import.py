@@ -176,7 +176,7 @@ BASE = ("{desk}/walk.csv", "--map", "{desk}/mapping.toml")
     ("argv", "code", "said"),
     [
         ((), 2, "which log"),
-        (("{desk}/gone.csv",), 3, "there is no such file"),
+        (("{desk}/gone.csv",), 3, "no such file"),
         ((str(SAMPLES),), 3, "neither a ROS 2 bag nor a LeRobot dataset"),
         ((str(LEG),), 3, "XML"),
         (("{desk}/mapping.toml",), 3, "no importer|fields"),
@@ -233,7 +233,7 @@ def test_no_space_and_no_permission_are_told_and_leave_nothing(
     answer = cli("import", desk / "walk.csv", "--map", desk / "mapping.toml", "--out", desk / "w.parquet")
     assert answer.code == 2
     assert said in answer.err
-    assert "choose a folder" in answer.err
+    assert "choose a writable folder" in answer.err
     assert set(desk.iterdir()) == files
 
 

@@ -399,7 +399,7 @@ def test_several_files_are_episodes(tmp_path: Path, good: Log) -> None:
     assert [rows.stop - rows.start for rows in log.episodes()] == [300, len(good) - 300]
     same(log, good, JOINT_COLUMNS)
     assert np.isnan(log.unknown["batt"][:300]).all()
-    assert any("episode of its own" in r for r in imported.remarks)
+    assert any("becomes an episode" in r for r in imported.remarks)
 
 
 def test_an_episode_column_is_kept(tmp_path: Path, good: Log) -> None:
@@ -550,7 +550,7 @@ def test_mistakes_in_a_mapping_are_told(tmp_path: Path, text: str, said: str) ->
             "more than one column",
         ),
         ({"time": {"column": "clock"}}, "clock"),
-        ({"joints": {"knee": {"to": "Knee"}}}, "nothing is called so"),
+        ({"joints": {"knee": {"to": "Knee"}}}, "no such name"),
         ({"joints": {"a": {"range": [0, 1]}}, "units": {"command": "range_0_100"}}, None),
         ({"units": {"position": "range_0_100"}}, r"joints\.a\] range"),
     ],
@@ -938,7 +938,7 @@ def test_a_trajectory_is_steps_that_the_next_one_replaces(tmp_path: Path, ros: R
     at = dict(zip(np.round(log.channels["position.a"], 2), log.channels["command.a"], strict=True))
     assert [at[t] for t in (0.1, 0.29, 0.3, 0.49, 0.5, 0.59, 0.6, 0.75, 0.99)] == [1, 1, 2, 2, 5, 5, 6, 6, 6]
     text = " ".join(imported.remarks)
-    assert "moves smoothly" in text
+    assert "interpolates between them" in text
     assert "0.1 s before the first command are left out" in text
 
 
@@ -1016,11 +1016,11 @@ UNUSABLE: dict[str, tuple[Make, dict[str, Any], str]] = {
         "both hold",
     ),
     "no stamps": (lambda _, sent: sent, {"clock": "header"}, "no header stamps on /leg/commands"),
-    "absent": (lambda _, sent: sent, {"state": "/nowhere"}, "no such topic"),
+    "absent": (lambda _, sent: sent, {"state": "/nowhere"}, "not a topic of the bag"),
     "wrong": (
         lambda _, sent: sent,
         {"command": ["/joint_states"], "state": ["/leg/commands"]},
-        "no use there",
+        "cannot be used there",
     ),
     "empty": (
         lambda ros, sent: [

@@ -50,8 +50,8 @@ def test_a_motion_is_readable_and_says_what_it_is(cli: Cli, motion: Path) -> Non
 def test_nothing_is_fitted_to_a_motion(cli: Cli, motion: Path, verb: str) -> None:
     answer = cli(verb, "--model", MODEL, "--log", motion, "--fit", "mass:arm")
     assert answer.code == 3
-    assert "to be played, not a recording" in answer.err
-    with pytest.raises(ModelError, match="to be played"):
+    assert "an excitation trajectory, not a recording" in answer.err
+    with pytest.raises(ModelError, match="excitation trajectory"):
         sb.make_study(sb.load_robot(MODEL), [sb.read_log(motion)], threads=1).train_problem(())
 
 

@@ -60,7 +60,7 @@ def check_clock(log: Log) -> Iterator[Problem]:
             "time.nan",
             "error",
             f"time, {places(log, bad)}",
-            f"{int(np.sum(~_is_time(log)))} of {len(log)} time stamps are missing, infinite or absurd",
+            f"{int(np.sum(~_is_time(log)))} of {len(log)} time stamps are missing, infinite or out of any range",
             "drop these rows, or restore their time stamps from the recorder",
         )
         return
@@ -90,7 +90,7 @@ def _order(log: Log) -> Iterator[Problem]:
     duplicate = np.flatnonzero((steps == 0) & within) + 1
     if len(duplicate):
         rounded = len(duplicate) > 0.1 * len(log)
-        why = "; so many that the stamps look rounded (float32, or whole ms)" if rounded else ""
+        why = "; so many that the stamps seem to be rounded (float32, or whole ms)" if rounded else ""
         yield Problem(
             "time.duplicate",
             "error",
@@ -117,7 +117,7 @@ def _rate(log: Log) -> Iterator[Problem]:
         remedy = (
             f"divide time by 1e{exponent}"
             if exponent in (3, 6, 9)
-            else "write time in seconds; or, if the samples really are so far apart, record faster than motion changes"
+            else "write time in seconds; or, if the samples really are so far apart, record at a higher rate"
         )
         yield Problem(
             "time.unit",

@@ -18,7 +18,7 @@ def check_columns(log: Log, joints: Sequence[str] | None) -> Iterator[Problem]:
             "error",
             column,
             f"the schema has no such column and the log has no {meant}: did you mean {meant}?",
-            f"rename {column} to {meant}; if it is something else, choose a name less like it",
+            f"rename {column} to {meant}; if it is something else, choose a name that differs more",
         )
     yield from _strange_channels(log, misspelled)
     yield from _pairs(log, misspelled)
@@ -88,14 +88,15 @@ def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
             "motion.not_recorded",
             "warning",
             "the whole file",
-            "this is a motion to be played, not a recording: it holds commands alone, and nothing can be fitted to it",
-            "play it on the robot, record what the sensors say, and give that; what a model makes of it: "
+            "this is an excitation trajectory, not a recording: it holds only commands, and nothing can be fitted to "
+            "it",
+            "execute it on the robot, record the sensors, and give that log; how a model moves with it: "
             "`sysid-btr replay --model M --log FILE --out DIR`",
         )
         return
     for channel, names, purpose in (
-        ("command", commands, "nothing says what the joints were told to do"),
-        ("position", positions, "there is nothing to compare a replay with"),
+        ("command", commands, "without it nothing says what the joints were commanded to do"),
+        ("position", positions, "without it a replay cannot be compared with anything"),
     ):
         if not names:
             yield Problem(
@@ -134,7 +135,7 @@ def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
             "command.missing",
             "warning",
             some(only_position),
-            "these joints have a position but no command: nothing is known about what drove them",
+            "these joints have a position but no command: what drove them is unknown",
             f"add {some([f'command.{name}' for name in only_position], 3)}, unless the joints are passive",
         )
 
@@ -180,6 +181,7 @@ def _against_model(log: Log, joints: Sequence[str], misspelled: dict[str, str]) 
             "joint.unknown",
             "warning",
             some(unknown),
-            f"the log has joints the model has not; they are ignored. Joints of the model: {some(joints, 12)}",
+            "the log has joints that the model does not have; they are ignored. Joints of the model: "
+            f"{some(joints, 12)}",
             "nothing, if they are irrelevant (fingers, say); else use a model that has them",
         )

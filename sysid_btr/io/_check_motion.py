@@ -117,9 +117,9 @@ def _late(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
             continue
         worst = max(chosen.values(), key=abs)
         text = (
-            f"the position follows the command {abs(worst):.2f} s late; a servo needs 0.1 s or so"
+            f"the position follows the command {abs(worst):.2f} s late; a servo takes about 0.1 s"
             if kind == "late"
-            else f"the position moves {abs(worst):.2f} s before the command says so"
+            else f"the position moves {abs(worst):.2f} s before the command"
         )
         yield Problem(
             f"joint.{kind}",
@@ -241,8 +241,9 @@ def _stuck(log: Log) -> Iterator[Problem]:
             "warning",
             "; ".join(pinned.values()),
             "the position stays exactly at its largest or smallest value while the command moves on: "
-            "a sensor at the end of its scale, or a joint at its stop",
-            "set these positions to NaN if the sensor was at its end; give the model the joint's range if it is a stop",
+            "a saturated sensor, or a joint at its end stop",
+            "set these positions to NaN if the sensor was saturated; give the model the joint's range if it is an end "
+            "stop",
         )
 
 
@@ -307,6 +308,6 @@ def _clipped_sensors(log: Log) -> Iterator[Problem]:
             "sensor.saturated",
             "warning",
             some(clipped, 8),
-            "the sensor stays exactly at the end of its scale: the true values lie beyond",
+            "the sensor is saturated: the true values lie beyond",
             "set these samples to NaN, or choose a larger measuring range",
         )

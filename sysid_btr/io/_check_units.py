@@ -86,7 +86,7 @@ def check_declared_units(log: Log) -> Iterator[Problem]:
                 "meta.units_key",
                 "warning",
                 where,
-                "the IMU has three kinds of channel, so this entry is not used",
+                "the IMU has three channels, so this entry is not used",
                 "use the keys imu.gyro (rad/s), imu.acc (m/s^2) and imu.angle (rad)",
             )
         elif group not in _ALLOWED:
@@ -280,7 +280,7 @@ def _velocity_unit(log: Log, degrees: set[str]) -> Iterator[Problem]:
             "error",
             by_channel(list(wrong)),
             f"the velocity is {ratio:.3g} times the rate of change of the position; {what.split(':')[0]}",
-            f"{what.split(': ')[1]}; the schema wants rad/s (or m/s)",
+            f"{what.split(': ')[1]}; the schema requires rad/s (or m/s)",
         )
 
 

@@ -56,7 +56,7 @@ def check_values(log: Log) -> Iterator[Problem]:
             "values.all_missing",
             "error",
             by_channel(empty),
-            "the column has no value at all, only NaN",
+            "the column has no values, only NaN",
             "leave the column out, or repair the recorder",
         )
     mostly = [n for n, share in missing.items() if 0.5 <= share < 1 and n.partition(".")[0] in _NEEDED]
@@ -65,7 +65,7 @@ def check_values(log: Log) -> Iterator[Problem]:
             "values.mostly_missing",
             "error",
             by_channel(mostly),
-            f"{100 * missing[mostly[0]]:.0f} % of the values are missing: too much to fit a motion to",
+            f"{100 * missing[mostly[0]]:.0f} % of the values are missing: too many to fit a motion to",
             "log commands and positions together, one row a sample; "
             "a slower sensor belongs on the clock of the slowest signal you fit",
         )
@@ -78,7 +78,7 @@ def check_values(log: Log) -> Iterator[Problem]:
             "warning",
             f"{by_channel(partly)}, {places(log, runs(flags))}",
             f"values are missing (NaN), at most {100 * missing[worst]:.2g} % of a column ({worst}); "
-            "they are not compared, and a missing command leaves the one before it in force",
+            "they are not compared, and a missing command is replaced by the previous one (zero-order hold)",
             "nothing, if that is right; else repair the recorder",
         )
 

@@ -92,7 +92,7 @@ def _unreadable(path: Path) -> Problem | None:
 
     if not path.exists():
         return problem(
-            "file.missing", "there is no such file", f"check the path; looked in {path.parent.resolve()}"
+            "file.missing", "the file does not exist", f"check the path; looked in {path.parent.resolve()}"
         )
     if not path.is_file():
         return problem(
@@ -153,7 +153,7 @@ def _meta(metadata: Mapping[bytes, bytes], problems: list[Problem]) -> LogMeta:
         report(
             "meta.missing",
             "file metadata",
-            "the Parquet metadata key `sysid_btr` is missing, so robot, mount and schema version are not known",
+            "the Parquet metadata key `sysid_btr` is missing, so robot, mount and schema version are unknown",
             f"add it with JSON such as {_EXAMPLE_META}, or convert the file with `sysid-btr import`",
         )
         return LogMeta()
@@ -214,7 +214,7 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
         )
     for key in ("robot", "source", "notes"):
         accept(key, isinstance(raw.get(key), str), "text")
-    accept("mount", raw.get("mount") in ("fixed", "free"), '"fixed" (the torso was held) or "free"')
+    accept("mount", raw.get("mount") in ("fixed", "free"), '"fixed" (the torso was fixed) or "free"')
     accept("command_hold", raw.get("command_hold") in ("zoh", "linear"), '"zoh" or "linear"')
     for key in ("sample_period", "servo_period"):
         value = raw.get(key)

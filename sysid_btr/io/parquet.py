@@ -80,7 +80,7 @@ def write_log(log: Log, path: str | os.PathLike[str], *, overwrite: bool = False
 
     path = Path(path)
     if path.exists() and not overwrite:
-        raise UsageError(f"{path} exists and is not overwritten; choose another name or ask for overwriting")
+        raise UsageError(f"{path} exists and is not overwritten; choose another name or allow overwriting")
     if not path.parent.is_dir():
         raise UsageError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
     columns: dict[str, pa.Array] = {"time": pa.array(np.asarray(log.time, dtype=np.float64))}
@@ -109,7 +109,7 @@ def write_log(log: Log, path: str | os.PathLike[str], *, overwrite: bool = False
     except OSError as error:
         reason = error.strerror or error
         raise UsageError(
-            f"cannot write {path}: {reason}; choose a folder with space that you may write to"
+            f"cannot write {path}: {reason}; choose a writable folder with enough space"
         ) from error
     finally:
         part.unlink(missing_ok=True)

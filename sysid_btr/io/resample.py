@@ -95,10 +95,10 @@ def command_at(log: Log, names: Sequence[str], times: FloatArray) -> FloatArray:
     commands = log.array("command", names)
     _require_increasing(log, across_episodes=True)
     if len(times) and not np.all(np.isfinite(times)):
-        raise UsageError("commands were asked for at a time that is not a finite number")
+        raise UsageError("commands were requested at a time that is not a finite number")
     silent = [name for name, column in zip(names, commands.T, strict=True) if np.all(np.isnan(column))]
     if silent:
-        raise LogError(f"no command was ever logged for {', '.join(silent)}; drop the column or the joint")
+        raise LogError(f"no command was logged for {', '.join(silent)}; drop the column or the joint")
     commands = _fill_forward(commands)
     held = holding_sample(log.time, times)
     if log.meta.command_hold == "zoh" or len(log) < 2:

@@ -114,7 +114,7 @@ def _unmatched(recordings: Sequence[Recording], told: ImportMap) -> Iterator[str
         if name not in there:
             guess = closest(name, there)
             hint = f"did you mean {guess}? " if guess else ""
-            yield f"--rename or [joints] {name}: nothing is called so; {hint}there are {some(there, 30)}"
+            yield f"--rename or [joints] {name}: no such name; {hint}available: {some(there, 30)}"
 
 
 def _renamed(column: str, told: ImportMap) -> str:
@@ -142,7 +142,7 @@ def _converted(signal: Signal, column: str, told: ImportMap, slides: bool | None
     wrong = None if slides is None else (_ANGLES if slides else _LINEAR).get(group)
     if unit.si == wrong:
         raise LogError(
-            f"{column} is said to be in {text}, but the joint {'slides' if slides else 'turns'} in the model: "
+            f"{column} is given in {text}, but the joint {'slides' if slides else 'turns'} in the model: "
             f"give it its own unit by --unit {column}=UNIT"
         )
     values = unit.convert(np.asarray(signal.values, dtype=np.float64))
@@ -158,7 +158,7 @@ def _share_of_range(text: str, name: str, rule: JointRule, si: str) -> Unit:
     """Normalised positions: the ends of the scale are those of the joint's calibrated range."""
     if rule.range is None:
         raise LogError(
-            f"{name} is normalised ({text}): say between which positions, in a mapping file: "
+            f"{name} is normalised ({text}): state its range in a mapping file: "
             f"[joints.{name}] range = [low, high], rad"
         )
     low, high = NORMALISED[text]
@@ -189,7 +189,7 @@ def _meta(
     remarks = []
     already_a_log = bool(first.source)
     if "mount" not in given and not already_a_log:
-        remarks.append('the torso is taken as held (mount "fixed"); if it could move: --mount free')
+        remarks.append('the base is assumed fixed (mount "fixed"); for a floating base: --mount free')
     periods = {r.meta.sample_period for r in recordings}
     meta = replace(
         first,
@@ -242,6 +242,6 @@ def _foreign(
         own = name
         if name in _RESERVED or name in taken or is_schema_column(name):
             own = f"foreign.{name}"
-            remarks.append(f"{name} is a name of the schema, so what the file called so is kept as {own}")
+            remarks.append(f"{name} is a name of the schema, so the file's column of that name is kept as {own}")
         foreign[own] = np.concatenate(filled)
     return foreign, remarks

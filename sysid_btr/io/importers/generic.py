@@ -87,8 +87,8 @@ def make_recording(path: Path, table: Table, found: Guess, time: str | None, tol
             continue
         if name in table.odd:
             problems.append(
-                f"column {name!r} ({column}): {table.odd[name]}; repair them, or name what stands for a "
-                "missing value in the mapping: [table] missing = [..]"
+                f"column {name!r} ({column}): {table.odd[name]}; repair them, or state how missing values are written "
+                "in the mapping: [table] missing = [..]"
             )
             continue
         values = np.asarray(table.columns[name], dtype=np.float64)
@@ -99,12 +99,12 @@ def make_recording(path: Path, table: Table, found: Guess, time: str | None, tol
     by_name = [name for name in by_name if told.unit(found.columns.get(name, "time"), name) is None]
     if by_name and not found.certain:
         listing = some([f"{name}: {found.units[name]}" for name in by_name], 4)
-        remarks.append(f"units as the columns' names say ({listing})")
+        remarks.append(f"units as given in the columns' names ({listing})")
     used = {time, number, *found.columns}
     foreign = {name: values for name, values in table.columns.items() if name not in used}
     if foreign:
         remarks.append(
-            f"{len(foreign)} column{'s are' if len(foreign) > 1 else ' is'} not understood, kept and not used: "
+            f"{len(foreign)} column{'s are' if len(foreign) > 1 else ' is'} not recognised, kept and not used: "
             f"{some(foreign, 12)}"
         )
     return Recording(path, seconds, tuple(signals), foreign, episode, meta, tuple(remarks))
@@ -139,7 +139,7 @@ def _as_told(table: Table, told: ImportMap) -> tuple[Guess, list[str]]:
             found |= matched
             if not matched:
                 problems.append(
-                    f"[channels] {kind} = {pattern!r} matches no column; there are {some(table.columns, 12)}"
+                    f"[channels] {kind} = {pattern!r} matches no column; available: {some(table.columns, 12)}"
                 )
     found |= {name: column for name, column in told.columns.items() if name in table.columns}
     exact = {n: n for n in table.columns if is_schema_column(n) and n not in found}
@@ -174,7 +174,7 @@ def _matches(pattern: str, kind: str, table: Table, told: ImportMap) -> list[tup
 def _no_column(name: str, table: Table, where: str) -> str:
     guess_ = closest(name, table.columns)
     hint = f"did you mean {guess_!r}? " if guess_ else ""
-    return f"{where}: there is no column {name!r}; {hint}there are {some(table.columns, 20)}"
+    return f"{where}: unknown column {name!r}; {hint}available: {some(table.columns, 20)}"
 
 
 def _episodes(table: Table, name: str, problems: list[str]) -> IntArray | None:
@@ -199,7 +199,7 @@ def _needed(path: Path, table: Table, found: Guess, time: str | None) -> Mapping
     missing += [f"which columns hold {c}s" for c in ("command", "position") if not found.joints(c)]
     said = " and ".join(missing)
     return MappingNeeded(
-        f"{path}: the names of its {len(table.columns)} columns do not tell {said}. A mapping file to fill in "
+        f"{path}: the names of its {len(table.columns)} columns do not reveal {said}. A mapping file to fill in "
         "is on standard output: save it (sysid-btr import FILE > mapping.toml), edit it, "
         "and give it by --map mapping.toml",
         partial(proposal, path, table, found),

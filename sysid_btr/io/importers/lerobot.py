@@ -63,12 +63,12 @@ class LeRobotImporter:
         root = _root(path)
         if root is not None and root != path:
             raise LogError(
-                f"{path} is a part of the LeRobot dataset {root}: give that folder; [lerobot] episodes = [..] in "
-                "a mapping chooses among its episodes"
+                f"{path} is part of the LeRobot dataset {root}: give that folder; select episodes by [lerobot] "
+                "episodes = [..] in a mapping"
             )
         if not (path / INFO).is_file():
             raise LogError(
-                f"{path}: no {INFO} in it: give the folder of the dataset that holds meta/ and data/"
+                f"{path}: it has no {INFO}: give the folder of the dataset that holds meta/ and data/"
             )
         info = _info(path)
         features = info["features"]
@@ -243,7 +243,7 @@ def _time(columns: Mapping[str, np.ndarray[Any, Any]], fps: float) -> tuple[Floa
     stamps = stamps.reshape(len(stamps))
     if nominal is not None and np.allclose(nominal, stamps, rtol=0, atol=_TOLERANCE):
         said = (
-            "times are frame / fps, as the dataset has them: when a sample was really taken is not recorded"
+            "times are frame / fps, as in the dataset: when a sample was really taken is not recorded"
         )
         return nominal, [said]
     return stamps, []

@@ -232,7 +232,7 @@ class ImportMap(_Part):
     @classmethod
     def _channels_exist(cls, channels: dict[str, list[str]]) -> dict[str, list[str]]:
         kinds = [kind for kind in SI if kind != "time"]
-        problems = [f"{c!r} is no channel; there are {', '.join(kinds)}" for c in channels if c not in kinds]
+        problems = [f"{c!r} is not a channel; available: {', '.join(kinds)}" for c in channels if c not in kinds]
         problems += [
             f"{pattern!r} needs one placeholder, such as {{joint}}"
             for patterns in channels.values()
@@ -247,7 +247,7 @@ class ImportMap(_Part):
     @classmethod
     def _columns_are_of_the_schema(cls, columns: dict[str, str]) -> dict[str, str]:
         problems = [
-            f"{to!r} is no column of the schema: use <channel>.<name>, such as position.HeadYaw or imu.acc_x"
+            f"{to!r} is not a column of the schema: use <channel>.<name>, such as position.HeadYaw or imu.acc_x"
             for to in columns.values()
             if not is_schema_column(to)
         ]
@@ -328,7 +328,7 @@ def with_flags(
     ]
     mount = (meta or {}).get("mount")
     if mount not in (None, "fixed", "free"):
-        wrong.append(f"--mount {mount}: use fixed (the torso was held) or free")
+        wrong.append(f"--mount {mount}: use fixed (fixed base) or free (floating base)")
     if wrong:
         raise UsageError("\n".join(wrong))
     content = told.model_dump(exclude_unset=True)

@@ -70,12 +70,12 @@ class NaoQiImporter:
         time = told.time.column or (None if told.time.rate else _time(table))
         found = Guess(time, columns, units, certain=True)
         if time is not None and time not in table.columns:
-            raise LogError(f"{path}: [time] column: there is no column {time!r}")
+            raise LogError(f"{path}: [time] column: unknown column {time!r}")
         if (time is None and told.time.rate is None) or not found.joints("position"):
             what = "no column holds the time" if time is None else "no key is a Position/Sensor"
             raise MappingNeeded(
-                f"{path}: {what}; name it in a mapping, or say how often the rows were taken "
-                "([time] rate = 100); a mapping to fill in is on standard output",
+                f"{path}: {what}; name it in a mapping, or state the sampling rate ([time] rate = 100); a mapping to "
+                "fill in is on standard output",
                 lambda joints: proposal(path, table, found, joints),
             )
         recording = make_recording(path, table, found, time, told)
@@ -102,7 +102,7 @@ def _understood(table: Table) -> tuple[dict[str, str], dict[str, str], list[str]
         units[key] = unit
     hands = [key for key in table.columns if any(f"{hand}/" in key for hand in _HANDS)]
     if hands:
-        remarks.append(f"hands open and close by a share, not an angle: {some(hands, 4)} kept and not used")
+        remarks.append(f"hands are commanded by a fraction, not an angle: {some(hands, 4)} kept and not used")
     for raw, newer in _RAW.items():
         keys = {k: c for k, c in columns.items() if f"InertialSensor/{raw}" in k and newer not in k}
         wrong = _not_si(table, raw, newer, keys, columns)
@@ -155,8 +155,8 @@ def _gravity(table: Table, columns: Mapping[str, str]) -> list[str]:
     if not upright or not np.nanmedian(table.columns[upright[0]]) < -_GRAVITY[0]:
         return []
     return [
-        f"{upright[0]} is about -9.8: this NaoQi counts gravity as pointing down, the schema wants specific force "
-        '(+9.8 upright); if the robot was upright, say --unit imu.acc=-1, or [units] "imu.acc_z" = -1 for one axis'
+        f"{upright[0]} is about -9.8: this NaoQi reports gravity pointing down, the schema requires specific force "
+        '(+9.8 upright); if the robot was upright, use --unit imu.acc=-1, or [units] "imu.acc_z" = -1 for one axis'
     ]
 
 
@@ -169,6 +169,6 @@ def _shared_motor(recording: Recording) -> Recording:
         if known is None or joint not in positions or f"command.{joint}" in commands:
             continue
         copy = Signal(known.source, f"command.{joint}", known.values, known.unit)
-        said = f"{joint} is on the motor of {twin} and has no command of its own: that of {twin} is taken"
+        said = f"{joint} shares the motor of {twin} and has no command of its own: that of {twin} is used"
         return replace(recording, signals=(*recording.signals, copy), remarks=(*recording.remarks, said))
     return recording

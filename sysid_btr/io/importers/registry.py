@@ -50,7 +50,7 @@ def get_importer(name: str) -> Importer:
 
         close = get_close_matches(name.lower(), available(), n=1, cutoff=0.5)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise UsageError(f"there is no format {name!r}.{hint} There are auto, {', '.join(available())}")
+        raise UsageError(f"unknown format {name!r}.{hint} Available: auto, {', '.join(available())}")
     return factory()
 
 
@@ -63,7 +63,7 @@ def recognise(path: Path) -> Importer:
         If there is no such source, or no importer for it.
     """
     if not path.exists():
-        raise LogError(f"{path}: there is no such file or folder; looked in {path.parent.resolve()}")
+        raise LogError(f"{path}: no such file or folder; looked in {path.parent.resolve()}")
     head = first_bytes(path)
     for name in (*sorted(set(installed(ENTRY_POINTS)) - set(BUILT_IN)), *BUILT_IN):
         importer = get_importer(name)
@@ -82,4 +82,4 @@ def _unrecognised(path: Path, head: bytes) -> str:
     if not head:
         return "the file has 0 bytes; record or copy it again"
     kind, remedy = looks_like(head)
-    return f"it looks like {kind}, and no importer reads that; {remedy}. Formats: {', '.join(available())}"
+    return f"it looks like {kind}, which no importer reads; {remedy}. Formats: {', '.join(available())}"

@@ -118,7 +118,7 @@ def import_log(
     log = _signed(log, sources, formats, model)
     remarks = [text for r in recordings for text in _with_path(r, len(sources))]
     if len(sources) > 1:
-        remarks.append(f"{len(sources)} sources: each is an episode of its own")
+        remarks.append(f"{len(sources)} sources: each becomes an episode")
     found = validate_log(log, joints=model.joints if model else None, ranges=model.ranges if model else None)
     renames = suggestions(log_joints(log), model.joints) if model else {}
     flags = tuple(dict.fromkeys(flag for problem in found for flag in _flags(problem, renames)))
@@ -132,7 +132,7 @@ def _importer(path: Path, wanted: str | Importer) -> Importer:
     if wanted == "auto":
         return recognise(path)
     if not path.exists():
-        raise LogError(f"{path}: there is no such file or folder; looked in {path.parent.resolve()}")
+        raise LogError(f"{path}: no such file or folder; looked in {path.parent.resolve()}")
     return get_importer(wanted)
 
 
@@ -233,9 +233,9 @@ _UNITS: Mapping[str, Callable[[Problem], Iterator[tuple[str, str]]]] = {
 """By code of a finding: the units it speaks for."""
 _NAMES = ("joint.misspelled", "joint.missing", "joint.unknown")
 _REMEDIES: Mapping[str, str] = {
-    "joint.missing": "if the robot's logs have no such joints, --force writes this one as it is",
-    "joint.sign": "turn the joint's axis round in a mapping file ([joints.NAME] sign = -1), or one of its columns "
+    "joint.missing": "if the robot does not log these joints, --force writes the log as it is",
+    "joint.sign": "reverse the joint's axis in a mapping file ([joints.NAME] sign = -1), or one of its columns "
     '([units] "command.NAME" = -1)',
-    "position.range": "put zero and sign right in a mapping file: [joints.NAME] offset = .., sign = -1",
+    "position.range": "correct zero and sign in a mapping file: [joints.NAME] offset = .., sign = -1",
     "joint.swapped": "swap them: --rename LEFT=RIGHT --rename RIGHT=LEFT, if all of their columns are swapped",
 }

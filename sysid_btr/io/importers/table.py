@@ -204,8 +204,8 @@ def _header(
         if len(names) == len(fields) and not any(_NUMBER.fullmatch(n) for n in names):
             return _unique(path, names), first
     raise LogError(
-        f"{path}: no header: line {first + 1} holds numbers, and nothing says what its {len(fields)} columns "
-        'are; write the names into the first line, or give them in the mapping: [table] header = ["time", ..]'
+        f"{path}: no header: line {first + 1} holds numbers, and its {len(fields)} columns have no names; "
+        'write the names into the first line, or give them in the mapping: [table] header = ["time", ..]'
     )
 
 
@@ -231,7 +231,7 @@ def _whole_rows(
 
     wrong = [(number, n) for number, line in body if (n := count(line)) != width]
     if wrong and not ended and wrong[-1][0] == body[-1][0] and wrong[-1][1] < width:
-        remarks = (f"line {wrong[-1][0]}, the last, is cut short and left out",)
+        remarks = (f"line {wrong[-1][0]}, the last, is incomplete and left out",)
         body, wrong = body[:-1], wrong[:-1]
     if wrong:
         shown = ", ".join(f"line {number} ({n})" for number, n in wrong[:5])
@@ -290,7 +290,7 @@ def _columns(
         )
         bad = np.flatnonzero((pd.to_numeric(column, errors="coerce").isna() & column.notna()).to_numpy())
         where = ", ".join(f"{columns[name][i]!r} in line {body[i][0]}" for i in bad[:3])
-        noun = "value is no number" if len(bad) == 1 else "values are no numbers"
+        noun = "value is not a number" if len(bad) == 1 else "values are not numbers"
         odd[name] = f"{len(bad)} {noun} ({where}{', ...' if len(bad) > 3 else ''})"
     return Table(columns, odd)
 
@@ -367,7 +367,7 @@ def as_seconds(table: Table, name: str, unit: str | float | None) -> tuple[Float
     if values.dtype == object:
         dates = _dates(values)
         if dates is None:
-            what = table.odd.get(name, "its values are no numbers")
+            what = table.odd.get(name, "its values are not numbers")
             raise LogError(
                 f"the time in column {name!r} cannot be read: {what}; "
                 "repair these lines, or name another column by [time] column in the mapping"

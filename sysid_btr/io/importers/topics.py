@@ -134,8 +134,8 @@ def choose_roles(path: Path, topics: Mapping[str, str], rule: RosRule) -> Roles:
     wrong += [t for t in rule.state if t in types and types[t] != JOINT_STATE]
     wrong += [rule.imu] if rule.imu and types.get(rule.imu, IMU) != IMU else []
     if absent or wrong:
-        listing = [f"[ros] {t}: the bag has no such topic" for t in absent]
-        listing += [f"[ros] {t}: messages of type {types[t]} are of no use there" for t in wrong]
+        listing = [f"[ros] {t}: not a topic of the bag" for t in absent]
+        listing += [f"[ros] {t}: messages of type {types[t]} cannot be used there" for t in wrong]
         raise UsageError("\n".join([f"{path}:", *listing, f"topics: {_listing(types)}"]))
     command = tuple(rule.command) or tuple(
         t for t, kind in types.items() if _is_command(t, kind) and t not in rule.state
@@ -146,7 +146,7 @@ def choose_roles(path: Path, topics: Mapping[str, str], rule: RosRule) -> Roles:
     imus = [rule.imu] if rule.imu else [t for t, kind in types.items() if kind == IMU]
     remarks = []
     if len(imus) > 1:
-        remarks.append(f"more than one Imu topic, none is used: say which by [ros] imu = {imus[0]!r}")
+        remarks.append(f"more than one Imu topic, none is used: select one by [ros] imu = {imus[0]!r}")
         imus = []
     if not state or not command:
         missing = "joint states (sensor_msgs/JointState)" if not state else "commands"
@@ -161,7 +161,7 @@ def choose_roles(path: Path, topics: Mapping[str, str], rule: RosRule) -> Roles:
     if unknown:
         some_ = some([f"{t} ({types[t]})" for t in unknown], 12)
         count = "1 topic is" if len(unknown) == 1 else f"{len(unknown)} topics are"
-        remarks.append(f"{count} not understood and not kept: {some_}")
+        remarks.append(f"{count} not recognised and not kept: {some_}")
     if scalars:
         remarks.append(f"single values are kept and not used: {some(scalars, 12)}")
     return replace(roles, unknown=unknown, remarks=tuple(remarks))
@@ -197,7 +197,7 @@ def proposal(
             '# imu = "/imu"',
             "",
             "[meta]",
-            'mount = "fixed"      # "free" if the torso could move',
+            'mount = "fixed"      # "free" for a floating base',
             "",
             "[joints]             # name in the bag = name in the model",
             "",
@@ -254,7 +254,7 @@ def _order(topic: str, count: int, rule: RosRule) -> Sequence[str]:
     names = rule.order(topic)
     if names is None:
         raise LogError(
-            f"{topic} holds {count} numbers without names: say whose they are, in a mapping file (--map FILE): "
+            f"{topic} holds {count} numbers without names: name them in a mapping file (--map FILE): "
             f'[ros] joints = ["..", ..] with {count} names, in their order'
         )
     if len(names) != count:
@@ -364,7 +364,7 @@ def _all_series(
     if conflicts:
         listing = "; ".join(f"{a} and {b} both hold {some(c, 4)}" for (a, b), c in conflicts.items())
         key = "command" if any(c[0].startswith("command.") for c in conflicts.values()) else "state"
-        raise LogError(f"{path}: {listing}; choose by [ros] {key} = [..] in a mapping file (--map FILE)")
+        raise LogError(f"{path}: {listing}; select by [ros] {key} = [..] in a mapping file (--map FILE)")
     return found, origin, remarks
 
 
@@ -396,8 +396,8 @@ def _in_order(path: Path, topic: str, rows: _Rows, header: bool) -> tuple[IntArr
         return np.array(list(merged), dtype=np.int64), list(merged.values()), remarks
     if rows.interpolates:
         remarks.append(
-            f"{topic}: its points are taken as steps, but a controller moves smoothly from one to the next; record "
-            "what it sent to the servos (the controller's own state topic) to have the true command"
+            f"{topic}: its points are taken as steps, but a controller interpolates between them; record what it sent "
+            "to the servos (the controller's state topic) to have the true command"
         )
     return stamps, [rows.values[i] for i in order], remarks
 
@@ -436,7 +436,7 @@ def _on_one_clock(
     if len(clock) < len(lead.time):
         waited = clock[0] - lead.time[0]
         said.append(
-            f"{waited:.3g} s before the first command are left out: nothing says what drove the joints"
+            f"{waited:.3g} s before the first command are left out: the joints' commands are unknown"
         )
     said.append(f"rows are the {len(clock)} stamps of {lead.source}")
     other = {s.source for s in series if not s.held and not np.array_equal(s.time, lead.time)}
@@ -447,13 +447,13 @@ def _on_one_clock(
     late = float(np.nanmean([lateness(s, clock) for s in commands]))
     if late > 0.05 * period > 0:
         notes = (
-            f"commands were sent between the joint states and show up with the next, {1e3 * late:.2g} ms late on "
-            "average; the servos seem that much quicker than they are"
+            f"commands were sent between the joint states and are logged with the next, {1e3 * late:.2g} ms late on "
+            "average; the servos appear faster than they are by that much"
         )
         said.append(notes)
     later = [s.column for s in commands if s.time[0] > begin + 2 * period]
     if later:
-        said.append(f"begin later than the first command and have no value until then: {some(later, 8)}")
+        said.append(f"start later than the first command and have no values until then: {some(later, 8)}")
     signals = tuple(
         Signal(f"{s.source} {s.column}", s.column, on_clock(s, clock), s.unit) for s in series if s.column
     )

@@ -114,7 +114,7 @@ def check_key(key: str) -> str | None:
     guess = closest(channel, (*SI, "imu"))
     hint = f"did you mean {guess}? " if guess else ""
     return (
-        f"{key!r} is no channel or column; {hint}there are {', '.join(SI)}, and columns as position.HeadYaw"
+        f"{key!r} is not a channel or column; {hint}available: {', '.join(SI)}, and columns as position.HeadYaw"
     )
 
 
