@@ -21,6 +21,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.excite.design import Design, Experiment, design, expect, find_sensors, mean_error, prepare, volume
 from sysid_btr.excite.motion import Clock, Family, Limits, as_log, find_motors, window
 from sysid_btr.excite.outcome import interrupted
+from sysid_btr.excite.settings import MotionSettings
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log, LogMeta
@@ -101,7 +102,7 @@ def test_a_motion_uses_what_a_limit_allows() -> None:
 
 def test_limits_are_those_of_the_model() -> None:
     robot = load_robot(str(LEG))
-    by_name = {m.joints[0]: m for m in find_motors(robot, margin=0.1)}
+    by_name = {m.joints[0]: m for m in find_motors(robot, MotionSettings(margin=0.1))}
     hip = by_name["HipPitch"]
     assert (hip.low, hip.high) == pytest.approx((-1.53 + 0.201, 0.48 - 0.201))
     # the nominal pose lies within the margin: it is allowed all the same
@@ -123,13 +124,13 @@ def test_limits_are_those_of_the_model() -> None:
 
 def test_joints_that_are_not_asked_for_stay() -> None:
     robot = toys.leg()
-    family = Family(find_motors(robot, joints=("k*",)), Clock.of(3, 100))
+    family = Family(find_motors(robot, MotionSettings(joints=("k*",))), Clock.of(3, 100))
     log = as_log(family, np.ones(len(family.names)), robot)
     assert np.ptp(log.channels["command.knee"]) > 0.1
     for joint in ("hip", "ankle"):
         assert np.all(log.channels[f"command.{joint}"] == 0)
     with pytest.raises(UsageError, match="elbow"):
-        find_motors(robot, joints=("elbow*", "hip"))
+        find_motors(robot, MotionSettings(joints=("elbow*", "hip")))
 
 
 def test_a_model_without_servos_cannot_be_excited() -> None:
@@ -233,7 +234,7 @@ def search(evaluations: int, journal: Journal | None = None, stop_after: int | N
     return design(
         toys.leg(),
         ASKED,
-        seconds=3.0,
+        motion=MotionSettings(seconds=3.0),
         noise=NOISE,
         rng=np.random.default_rng(5),
         budget=Budget(evaluations=evaluations),
@@ -249,7 +250,7 @@ def against_the_sample() -> Design:
         load_robot(str(LEG)),
         ("mass:KneePitch,HipPitch,HipRoll", "kp:*=shared"),
         reference=read_log(CLEAN),
-        seconds=5.0,
+        motion=MotionSettings(seconds=5.0),
         budget=Budget(evaluations=40),
         threads=1,
     )

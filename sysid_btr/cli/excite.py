@@ -21,6 +21,7 @@ from sysid_btr.cli.kinds import Names
 from sysid_btr.cli.options import option
 from sysid_btr.cli.terminal import print_json, remark
 from sysid_btr.errors import InterruptedRun, UsageError
+from sysid_btr.excite.settings import MotionSettings
 from sysid_btr.progress import Interrupted, ProgressLine
 from sysid_btr.run_folder import Folder
 
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 class ExciteOptions(ModelOptions, LogOptions, ParameterOptions, SeedOptions, ThreadOptions, OutOptions, JsonOptions):
     """Options of `excite`."""
 
-    seconds: float = option(10.0, "Length of the motion.", metavar="S", decides=True)
-    rate: float = option(100.0, "Samples per second.", metavar="HZ", decides=True)
+    seconds: float = option(MotionSettings.seconds, "Length of the motion.", metavar="S", decides=True)
+    rate: float = option(MotionSettings.rate, "Samples per second.", metavar="HZ", decides=True)
     noise: float | None = option(
         None,
         "Noise floor of the position sensors (rad, m).",
@@ -45,7 +46,10 @@ class ExciteOptions(ModelOptions, LogOptions, ParameterOptions, SeedOptions, Thr
     )
     joints: Names = option((), "Joints that move.", otherwise="all with a servo", metavar="GLOB[,GLOB..]", decides=True)
     margin: float = option(
-        0.05, "Part of each joint's range that is not used, at either end.", metavar="FRACTION", decides=True
+        MotionSettings.margin,
+        "Part of each joint's range that is not used, at either end.",
+        metavar="FRACTION",
+        decides=True,
     )
     max_velocity: float | None = option(
         None, "Maximum velocity of every joint.", otherwise="6 rad/s; slides 0.3 m/s", metavar="V", decides=True
@@ -111,6 +115,14 @@ def _search(options: ExciteOptions, robot: Robot, reference: Log | None) -> tupl
     from sysid_btr.excite.design import design, find_criterion, find_estimator
 
     estimator, criterion = find_estimator(options.estimator), find_criterion(options.criterion)
+    motion = MotionSettings(
+        seconds=options.seconds,
+        rate=options.rate,
+        joints=options.joints,
+        margin=options.margin,
+        velocity=options.max_velocity,
+        acceleration=options.max_acceleration,
+    )
     keeper = Keeper.open("excite", options, robot)
     assert keeper.folder is not None
     with ProgressLine("excite") as progress:
@@ -119,13 +131,8 @@ def _search(options: ExciteOptions, robot: Robot, reference: Log | None) -> tupl
                 robot,
                 options.fit,
                 reference=reference,
-                seconds=options.seconds,
-                rate=options.rate,
+                motion=motion,
                 noise=options.noise,
-                joints=options.joints,
-                margin=options.margin,
-                velocity=options.max_velocity,
-                acceleration=options.max_acceleration,
                 criterion=criterion,
                 estimator=estimator,
                 rng=generator(options.seed),

@@ -25,7 +25,8 @@ from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.estimators.registry import get_estimator
-from sysid_btr.excite.motion import MARGIN, Clock, Family, as_log, find_motors
+from sysid_btr.excite.motion import Clock, Family, as_log, find_motors
+from sysid_btr.excite.settings import MotionSettings
 from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, estimates
 from sysid_btr.identify.numerics import choose_numerics
@@ -383,14 +384,9 @@ def design(
     robot: Robot,
     parameters: Sequence[str],
     *,
+    motion: MotionSettings | None = None,
     reference: Log | None = None,
-    seconds: float = 10.0,
-    rate: float = 100.0,
     noise: float | None = None,
-    joints: Sequence[str] = (),
-    margin: float = MARGIN,
-    velocity: float | None = None,
-    acceleration: float | None = None,
     criterion: Criterion = mean_error,
     estimator: Estimator | None = None,
     rng: Generator | None = None,
@@ -406,11 +402,10 @@ def design(
     ----------
     robot : model, with its torso held.
     parameters : expressions of the grammar.
+    motion : its length, sampling and limits.
     reference : log of a motion to compare with, as far as the new one lasts; its sensors and their noise are
         assumed for the new one. None: the initial motion of the search, and position encoders.
-    seconds, rate : length (s) and sampling (Hz) of the motion.
     noise : see `find_sensors`.
-    joints, margin, velocity, acceleration : see `sysid_btr.excite.motion.find_motors`.
     criterion : score of a motion.
     estimator, rng, budget, journal, progress : of the search; default `CmaEs`, seed 0, `EVALUATIONS` motions.
     threads : worker threads, 0 for all cores.
@@ -426,10 +421,8 @@ def design(
     began = perf_counter()
     robot = configured(robot, reference)
     rng = np.random.default_rng(0) if rng is None else rng
-    motors = find_motors(
-        robot, joints=joints, reference=reference, margin=margin, velocity=velocity, acceleration=acceleration
-    )
-    family = Family(motors, Clock.of(seconds, rate))
+    motion = motion or MotionSettings()
+    family = Family(find_motors(robot, motion, reference), Clock.of(motion.seconds, motion.rate))
     start = rng.uniform(-1.0, 1.0, len(family.names))
     meta = LogMeta(robot=robot.name) if reference is None else reference.meta
     first = as_log(family, start, robot, times=1, like=meta)

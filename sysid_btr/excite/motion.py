@@ -19,13 +19,12 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError, UsageError
+from sysid_btr.excite.settings import MotionSettings
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log, LogMeta
     from sysid_btr.models.robot import Robot
 
-MARGIN = 0.05
-"""Fraction of a joint's range that is left free at either end: servos overshoot."""
 VELOCITY = {False: 6.0, True: 0.3}
 """rad/s of hinges, m/s of slides, where nothing is said: what small servos do with ease."""
 ACCELERATION = {False: 60.0, True: 3.0}
@@ -222,13 +221,7 @@ def _largest(wave: FloatArray, rest: FloatArray, low: float, high: float) -> flo
 
 
 def find_motors(
-    robot: Robot,
-    *,
-    joints: Sequence[str] = (),
-    reference: Log | None = None,
-    margin: float = MARGIN,
-    velocity: float | None = None,
-    acceleration: float | None = None,
+    robot: Robot, motion: MotionSettings | None = None, reference: Log | None = None
 ) -> tuple[Limits, ...]:
     """Motors of a robot and what their commands may do.
 
@@ -240,10 +233,9 @@ def find_motors(
     Parameters
     ----------
     robot : model.
-    joints : globs of the joints that shall move; the others are commanded to their nominal position. None: all.
+    motion : its joints and limits; joints that are not asked for are commanded to their nominal position. Where it has
+        none, `VELOCITY` and `ACCELERATION` are those of every joint.
     reference : log of a motion that the robot is known to survive.
-    margin : fraction of a joint's range, below one half.
-    velocity, acceleration : rad/s (m/s) and rad/s^2 (m/s^2) of every joint; None for `VELOCITY`, `ACCELERATION`.
 
     Raises
     ------
@@ -256,13 +248,14 @@ def find_motors(
 
     from sysid_btr.models.robot import joint_ranges, servo_actuators, servo_joints
 
-    if not 0 <= margin < 0.5:
-        raise UsageError(f"--margin {margin:g}: a fraction of each joint's range, 0 to less than 0.5")
+    motion = motion or MotionSettings()
+    if not 0 <= motion.margin < 0.5:
+        raise UsageError(f"--margin {motion.margin:g}: a fraction of each joint's range, 0 to less than 0.5")
     model = robot.compile()
     known = servo_joints(robot)
     if not known:
         raise ModelError(f"model {robot.name} has no position servo, so no joint can be commanded")
-    chosen = _chosen(known, joints)
+    chosen = _chosen(known, motion.joints)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
@@ -281,12 +274,12 @@ def find_motors(
         for joint in together:
             a, dof = actuators[joint], int(model.joint(joint).dofadr[0])
             slides = int(model.joint(joint).type[0]) == 2
-            least, most = _room(joint, home, ranges, reference, margin, slides)
+            least, most = _room(joint, home, ranges, reference, motion.margin, slides)
             if model.actuator_ctrllimited[a]:
                 least, most = max(least, model.actuator_ctrlrange[a, 0]), min(most, model.actuator_ctrlrange[a, 1])
             low, high = max(low, least), min(high, most)
-            fast = min(fast, VELOCITY[slides] if velocity is None else velocity)
-            sharp = min(sharp, ACCELERATION[slides] if acceleration is None else acceleration)
+            fast = min(fast, VELOCITY[slides] if motion.velocity is None else motion.velocity)
+            sharp = min(sharp, ACCELERATION[slides] if motion.acceleration is None else motion.acceleration)
             if model.actuator_forcelimited[a]:
                 torque = abs(model.actuator_gear[a, 0]) * float(np.abs(model.actuator_forcerange[a]).min())
                 sharp = min(sharp, TORQUE_SHARE * torque / float(inertia[dof, dof]))
