@@ -211,6 +211,9 @@ FITTING = (*BASE, "--fit", "mass:*")
         (("fit", *BASE, "--fit", "mas:arm"), 2, "'mass'"),
         (("fit", *BASE, "--fit", "mass:*=common"), 2, "shared"),
         (("fit", *FITTING, "--estimator", "lsqq"), 2, "lsq"),
+        # said before the log is even looked for
+        (("fit", "--model", "{arm}", "--log", "no", "--fit", "mass:*", "--distance", "mse"), 2, "lsq minimises"),
+        (("fit", *FITTING, "--estimator", "cmaes+lsq", "--distance", "phi2"), 2, "cmaes+lsq minimises"),
         (("fit", *FITTING, "--holdout", "1.5"), 2, "between 0 and 1"),
         (("fit", *FITTING, "--holdout", "gone"), 3, "gone"),
         (("fit", *FITTING, "--start", "kp:*=1"), 2, "mass:arm"),

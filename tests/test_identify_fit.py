@@ -96,6 +96,17 @@ def clean_fit() -> Fit:
     return fit(sample_study("leg_clean"), LEG_FIT)
 
 
+def test_the_budget_bounds_all_searches_of_a_fit() -> None:
+    study, free = sample_study("leg_friction"), ("mass:HipPitch,KneePitch", "kp:*=shared")
+    whole = fit(study, free)
+    assert whole.replays > 60  # the coarse fits before the estimator's, and what follows it, are most of it
+    cut = fit(study, free, budget=Budget(evaluations=20))
+    assert not cut.result.converged
+    assert cut.replays <= 20 + 10  # each search has to simulate where it begins, and its result is judged
+    same = fit(study, free, budget=Budget(evaluations=whole.replays))
+    assert same.values.tolist() == whole.values.tolist()
+
+
 # --- covariance -------------------------------------------------------------------------------------------
 
 BLOCKS, LENGTH = 500, 20

@@ -164,10 +164,11 @@ def search_of(
     """A fit as it was asked for, of whatever study."""
     from sysid_btr.estimators import get_estimator
     from sysid_btr.estimators.base import Budget
-    from sysid_btr.identify.fit import fit
+    from sysid_btr.identify.fit import check_distance, fit
     from sysid_btr.objectives.distance import get_distance
 
     estimator, distance = get_estimator(options.estimator), get_distance(options.distance)
+    check_distance(estimator, distance)
 
     def search(study: Study, terms: Terms, rng: Generator, journal: Journal, progress: ProgressLine) -> Fit:
         return fit(

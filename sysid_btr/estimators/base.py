@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Protocol, Self, TypeGuard, runtime_checkable
 
@@ -77,6 +77,10 @@ class Budget:
             raise UsageError(f"a budget of {self.evaluations} evaluations is too small: give at least 1")
         if self.seconds is not None and not self.seconds > 0.0:
             raise UsageError(f"a budget of {self.seconds} s is too small: give a positive time")
+
+    def after(self, evaluations: int) -> Budget:
+        """What is left after as many; never nothing, as whoever goes on from a point has to simulate it."""
+        return self if self.evaluations is None else replace(self, evaluations=max(self.evaluations - evaluations, 1))
 
 
 class Progress(Protocol):

@@ -112,7 +112,7 @@ def deferred_fit(
     near = corrected(problem, cheap, problem.start)
     loss, evaluations = float(np.sum(near.right**2)), 2
     for _ in range(ROUNDS):
-        result = bare.fit(near, rng=rng, budget=budget, journal=journal, progress=progress)
+        result = bare.fit(near, rng=rng, budget=budget.after(evaluations), journal=journal, progress=progress)
         evaluations += result.evaluations
         if result.termination in (Termination.INTERRUPTED, Termination.BUDGET_SPENT, Termination.NO_FINITE_CANDIDATE):
             return replace(result, evaluations=evaluations)

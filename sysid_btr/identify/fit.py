@@ -12,7 +12,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, silent, uses_residuals
-from sysid_btr.estimators.chain import Chain
+from sysid_btr.estimators.chain import Chain, needs_residuals
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.coarse import realise_servo, weigh_columns
@@ -148,7 +148,8 @@ def fit(
     parameters : expressions of the grammar, or terms.
     estimator : default least squares.
     rng : for estimators that draw; default seed 0.
-    budget, journal, progress : see `sysid_btr.estimators`.
+    budget, journal, progress : see `sysid_btr.estimators`. The budget is that of all searches of the fit together; what
+        prepares them (numerics, the realisation of a servo) and what describes their result is not counted.
     start : (p,) where to begin; default the nominal values.
     distance : minimised instead of the whitened squares (MSE, phi2), by an estimator that needs no residuals.
         Intervals are then those of the likelihood at the point found.
@@ -168,16 +169,16 @@ def fit(
     if not terms.parameters:
         raise UsageError("nothing to fit: free at least one parameter, for example --fit 'mass:*'")
     estimator = LeastSquares() if estimator is None else estimator
-    if distance is not None and uses_residuals(estimator):
-        raise UsageError("lsq minimises squared residuals: for another distance choose ga, cmaes or nlopt:ALGORITHM")
+    check_distance(estimator, distance)
     rng = np.random.default_rng(0) if rng is None else rng
     model = Model.of(terms, start)
-    search = _Search(estimator, distance, rng, budget or Budget(), Journal() if journal is None else journal, progress)
+    budget = budget or Budget()
+    search = _Search(estimator, distance, rng, budget, Journal() if journal is None else journal, progress)
     solved = search.run(realise_servo(study, model), model)
     study, replays = solved.study, solved.replays
     at = Optimum.of(solved.problem, solved.result, study.stencil(terms))
     if solved.by_residuals:
-        study, at, shift, spent = with_short_steps(study, model, at, rng, progress)
+        study, at, shift, spent = with_short_steps(study, model, at, rng, budget.after(replays), progress)
         replays += spent
     else:
         shift = at.shift
@@ -189,7 +190,7 @@ def fit(
         shift, known = np.hypot(shift, fused.error), fused.known
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift, known)
     if solved.by_residuals:
-        values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known)
+        values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))
         replays += spent
     return Fit(
         study=study,
@@ -203,6 +204,14 @@ def fit(
         seconds=perf_counter() - began,
         optimum=values if known is None else optimum,
     )
+
+
+def check_distance(estimator: Estimator, distance: Distance | None) -> None:
+    """Refuse to minimise a distance by an estimator that minimises squared residuals."""
+    if distance is not None and needs_residuals(estimator):
+        raise UsageError(
+            f"{estimator.name} minimises squared residuals: for another distance choose ga, cmaes or nlopt:ALGORITHM"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +253,8 @@ class _Search:
             goal = problem if self.distance is None else DistanceProblem(problem, self.distance)
             result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
             return _Solved(study, problem, result, result.evaluations + spent, False)
-        study, coarse = weigh_columns(study, model.at(problem.start))
+        study, coarse = weigh_columns(study, model.at(problem.start), budget)
+        budget = budget.after(coarse.evaluations)
         problem, spent = study.train_problem(coarse.model), spent + coarse.evaluations
         if study.procedure.deferred:
             result = deferred_fit(

@@ -27,6 +27,7 @@ def fix_unidentifiable(
     found: tuple[Estimate, ...],
     jacobian: FloatArray,
     known: Known | None = None,
+    budget: Budget | None = None,
 ) -> tuple[FloatArray, tuple[Estimate, ...], int]:
     """Fix what is not identifiable at its nominal value, and refit the rest: values, estimates, evaluations.
 
@@ -52,7 +53,7 @@ def fix_unidentifiable(
     start = np.clip(values + change, problem.lower, problem.upper)
     conditional = Conditional(problem, ~blind, start)
     result = LeastSquares(confirm=False, least_gain=ENOUGH).fit(
-        conditional, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
+        conditional, rng=np.random.default_rng(0), budget=budget or Budget(), journal=Journal(), progress=silent
     )
     if result.termination is Termination.INTERRUPTED:
         raise KeyboardInterrupt

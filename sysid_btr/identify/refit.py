@@ -80,6 +80,7 @@ def refit(
     *,
     polish: bool = False,
     iterations: int = 8,
+    budget: Budget | None = None,
     progress: Progress = silent,
     judged: Study | None = None,
 ) -> Fitted:
@@ -103,7 +104,7 @@ def refit(
     estimator = study.procedure.suited(estimator)
     if structural:
         estimator = replace(estimator, forward_step=step, central_step=step)
-    rng, budget = np.random.default_rng(0), Budget()
+    rng, budget = np.random.default_rng(0), budget or Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
     # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
@@ -186,12 +187,13 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     return replace(study, inflation=worst)
 
 
-def robust_refit(study: Study, fitted: Fitted, rounds: int) -> tuple[Study, Fitted]:
-    """Refit with inflated noise until the columns' errors settle."""
+def robust_refit(study: Study, fitted: Fitted, rounds: int, budget: Budget | None = None) -> tuple[Study, Fitted]:
+    """Refit with inflated noise until the columns' errors settle; what `fitted` took is of the budget too."""
+    budget = budget or Budget()
     for _ in range(rounds):
         before = fitted.train_columns
         study = inflate(study, fitted)
-        again = refit(study, fitted.model)
+        again = refit(study, fitted.model, budget=budget.after(fitted.evaluations))
         fitted = replace(again, evaluations=again.evaluations + fitted.evaluations)
         # held-out data must not decide how long is fitted
         if np.all(np.abs(np.log(fitted.train_columns / before)) < 0.02):

@@ -57,7 +57,7 @@ class Optimum:
 
 
 def with_short_steps(
-    study: Study, model: Model, at: Optimum, rng: Generator, progress: Progress
+    study: Study, model: Model, at: Optimum, rng: Generator, budget: Budget, progress: Progress
 ) -> tuple[Study, Optimum, FloatArray, int]:
     """Halve the integrator's step until it moves no estimate by much.
 
@@ -76,7 +76,8 @@ def with_short_steps(
             break
         study = replace(study, numerics=study.numerics.halved())
         problem = study.train_problem(model.at(at.values))
-        polished = LeastSquares().fit(problem, rng=rng, budget=Budget(), journal=Journal(), progress=progress)
+        left = budget.after(spent)
+        polished = LeastSquares().fit(problem, rng=rng, budget=left, journal=Journal(), progress=progress)
         spent += polished.evaluations
         at = Optimum.of(problem, polished, study.stencil(model.terms))
     return study, at, shift, spent
