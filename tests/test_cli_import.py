@@ -296,7 +296,7 @@ def test_the_study_file_says_what_the_log_holds(swinging: Path) -> None:
     assert study["channels"] == ["position"]
     assert "mass:arm" in study["fit"]
     assert "kp:*" in study["fit"]
-    assert "9.99 s in 1 episode, 1000 samples every 10 ms; torso held (fixed)" in text
+    assert "9.99 s in 1 episode, 1000 samples every 10 ms; torso fixed" in text
     log = read_log(SAMPLES / "pendulum_clean.parquet")
     assert f"{np.ptp(log.channels['position.pendulum']):.3g} rad" in text
     assert "no effort is logged" in text

@@ -41,20 +41,20 @@ class JointSeen:
     ----------
     name : of the joint.
     unit : ``rad`` or ``m``.
-    moved, told : distance between the extremes of position and command; NaN where not logged.
+    moved, commanded : distance between the extremes of position and command; NaN where not logged.
     noise : of the position.
     """
 
     name: str
     unit: str
     moved: float
-    told: float
+    commanded: float
     noise: NoiseFloor
 
     @property
     def moves(self) -> bool:
-        """Whether it moved enough to tell anything."""
-        return bool(max(np.nan_to_num(self.moved), np.nan_to_num(self.told)) > MOVED[self.unit])
+        """Whether it moved enough to be informative."""
+        return bool(max(np.nan_to_num(self.moved), np.nan_to_num(self.commanded)) > MOVED[self.unit])
 
 
 def study_file(robot: Robot, logs: Sequence[Log], model: str, out: Path | None = None) -> str:
@@ -137,16 +137,16 @@ def _what_the_log_holds(log: Log, joints: Sequence[JointSeen]) -> Iterator[str]:
     steps = np.concatenate([np.diff(log.time[r]) for r in rows])
     period = log.meta.sample_period or (float(np.median(steps)) if len(steps) else np.nan)
     parts = f"{len(rows)} episodes" if len(rows) > 1 else "1 episode"
-    held = "held (fixed)" if log.meta.mount == "fixed" else "free to move"
-    yield f"# --- {_file(log)}: {seconds:.4g} s in {parts}, {len(log)} samples every {si(period, 's')}; torso {held}"
-    yield f"# {'joint':{WIDTH}}{'moved by':>12}{'told to by':>12}{'noise':>14}"
+    torso = "fixed" if log.meta.mount == "fixed" else "free to move"
+    yield f"# --- {_file(log)}: {seconds:.4g} s in {parts}, {len(log)} samples every {si(period, 's')}; torso {torso}"
+    yield f"# {'joint':{WIDTH}}{'moved by':>12}{'command':>12}{'noise':>14}"
     for joint in joints:
-        told = "-" if np.isnan(joint.told) else si(joint.told, joint.unit)
-        note = "" if joint.moves else "   hardly moved: this log tells little of it"
+        command = "-" if np.isnan(joint.commanded) else si(joint.commanded, joint.unit)
+        note = "" if joint.moves else "   hardly moved: this log says little about it"
         if joint.noise.method == "quantisation":
             note = f"   (encoder step {si(joint.noise.step, joint.unit)}){note}"
         yield (
-            f"# {joint.name:{WIDTH}}{si(joint.moved, joint.unit):>12}{told:>12}"
+            f"# {joint.name:{WIDTH}}{si(joint.moved, joint.unit):>12}{command:>12}"
             f"{si(joint.noise.sigma, joint.unit):>14}{note}"
         )
     for channel in CHANNELS:
@@ -154,12 +154,12 @@ def _what_the_log_holds(log: Log, joints: Sequence[JointSeen]) -> Iterator[str]:
         if names and channel != "position":
             yield f"# {channel}: {len(names)} logged; {_use(log, channel)}"
     if not log.joints("effort"):
-        yield "# no effort is logged: measured torques would tell masses from gains"
+        yield "# no effort is logged: measured torques would separate masses from gains"
 
 
 def _use(log: Log, channel: str) -> str:
     if channel == "command":
-        how = "held until the next" if log.meta.command_hold == "zoh" else "interpolated"
+        how = "each held until the next" if log.meta.command_hold == "zoh" else "interpolated"
         return f"what the replay is driven with, {how}"
     if channel in FITTED:
         floors = [noise_floor(log.channels[f"{channel}.{n}"]).sigma for n in log.joints(channel)]
@@ -225,7 +225,7 @@ def _from_table(robot: Robot) -> Iterator[tuple[str, str]]:
 
 
 def _masses(model: mujoco.MjModel, moving: Sequence[str], free: bool) -> Iterator[tuple[str, str]]:
-    """Masses of the bodies that hang on a joint that moved; a base that was held tells nothing of its own."""
+    """Masses of the bodies that hang on a joint that moved; a fixed base says nothing of its own."""
     import mujoco
 
     for b in range(1, model.nbody):
