@@ -689,7 +689,7 @@ def test_the_verb_writes_result_figure_and_report(tmp_path: Path, capsys: pytest
     ("change", "told"),
     [
         (("--robot-sim", "ant"), "which robot"),
-        (("--fit", "length:LFFemur"), "what shall be fitted"),
+        (("--fit", "length:LFFemur"), "no parameters to fit"),
         (("--model", "ant"), "which robot"),
     ],
 )

@@ -195,7 +195,7 @@ BASE = ("{desk}/walk.csv", "--map", "{desk}/mapping.toml")
         ((*BASE, "--mount", "wall"), 2, "fixed .* or free"),
         ((*BASE, "--model", "robot"), 4, "neither a built-in model"),
         ((*BASE, "--out", "{desk}/there.parquet"), 2, "--overwrite"),
-        ((*BASE, "--out", "{desk}/walk.csv", "--overwrite"), 2, "also read"),
+        ((*BASE, "--out", "{desk}/walk.csv", "--overwrite"), 2, "also an input"),
         ((*BASE, "--out", "{desk}"), 2, "is a folder"),
         ((*BASE, "--out", "{desk}/no/walk.parquet"), 2, "create it first"),
         ((*BASE, "--colour", "red"), 2, "--colour"),

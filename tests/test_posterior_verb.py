@@ -212,7 +212,7 @@ def test_a_budget_too_small_for_one_draw_exits_5(cli: Cli) -> None:
     ("argv", "said"),
     [
         (("--priors", "kp=gauss(1, 2)"), "gauss"),
-        (("--priors", "kv=normal(1, 2)"), "kv is not a free parameter"),
+        (("--priors", "kv=normal(1, 2)"), "kv is not a fitted parameter"),
         (("--priors", "kp"), "--priors"),
         (("--walkers", "7"), "even"),
         (("--ensembles", "1"), "--ensembles"),

@@ -65,7 +65,7 @@ def test_a_motion_is_replayed_and_its_reach_is_told(cli: Cli, motion: Path, tmp_
     assert np.ptp(predicted.channels["position.pendulum"]) > 0.5
     mixed = cli("replay", "--model", MODEL, "--log", motion, "--log", RECORDED, "--threads", "1")
     assert mixed.code == 2
-    assert "one or the other" in mixed.err
+    assert "not both" in mixed.err
 
 
 @pytest.mark.parametrize("more", [{"source": "measured"}, {"channel": "velocity.pendulum"}], ids=["source", "sensors"])
@@ -125,7 +125,7 @@ def test_a_table_in_degrees_is_imported_from_python(tmp_path: Path) -> None:
         (("--model", MODEL, "--log", MODEL, "--fit", "mass:*"), 3, "give it with --model"),
         (("--config", "{mapping}"), 2, "a mapping for `sysid-btr import`"),
         (("--config", "{study}"), 2, "log: 3 is not allowed; expected text or a list of texts"),
-        (("--config", "{study}"), 2, "sed: no such key; did you mean seed?"),
+        (("--config", "{study}"), 2, "sed: unknown key; did you mean seed?"),
     ],
     ids=lambda value: " ".join(value)[-60:] if isinstance(value, tuple) else None,
 )

@@ -760,7 +760,7 @@ def test_a_fit_begins_where_another_ended(finished: Path, capsys: pytest.Capture
 def test_values_that_are_not_free_are_told(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     run(["fit", *pendulum_flags(), "--params", str(finished), "--fit", "mass:arm"])
-    assert "--params: not free here, and so not used: frictionloss:pendulum" in capsys.readouterr().err
+    assert "--params: not fitted here, so not used: frictionloss:pendulum" in capsys.readouterr().err
 
 
 def test_one_value_from_two_flags_is_refused(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -120,11 +120,11 @@ def btr(options: BtrOptions) -> int:
     model = find_robot(options.model, options.bounds)
     check_freed(model, options.fit)
     if options.resume and options.out is None:
-        raise UsageError("--resume goes on with the journals of an earlier run: give its --out folder")
+        raise UsageError("--resume continues from the journals of an earlier run: give its --out folder")
     space = get_space(model.name)
     duration = DURATIONS.get(model.name, LONG) if options.duration is None else options.duration
     if not duration >= 1:
-        raise UsageError(f"--duration {duration:g}: a trial needs a second at least")
+        raise UsageError(f"--duration {duration:g}: a trial takes at least a second")
     task, settings = Walk(duration), settings_of(options, space)
     terms, robot = parse_parameters(options.fit, model), robot_of(options, model, task, space)
     folder = None if options.out is None else _open(options.out, options.resume, options.overwrite)
@@ -146,8 +146,8 @@ def btr(options: BtrOptions) -> int:
                 fingerprint=fingerprint("btr", options, model),
             )
         except Interrupted:
-            where = "nothing is kept without --out" if folder is None else f"what is done is kept in {folder.path}"
-            more = "" if folder is None else ": the same command with --resume goes on from there"
+            where = "without --out nothing is kept" if folder is None else f"finished work is kept in {folder.path}"
+            more = "" if folder is None else ": repeat the command with --resume to continue"
             raise InterruptedRun(f"interrupted; {where}{more}") from None
     result = outcome.to_dict(wall_s=perf_counter() - began)
     if folder is not None:
@@ -172,9 +172,9 @@ def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
     by_distance = "lsq" if options.distance == LIKELIHOOD else "cmaes"
     search = by_distance if options.model_search is None else options.model_search
     if options.search not in ("ga", "cmaes"):
-        raise UsageError(f"--search {options.search}: there are ga and cmaes")
+        raise UsageError(f"--search {options.search}: use ga or cmaes")
     if search not in models:
-        raise UsageError(f"--model-search {search}: there are {', '.join(models)}")
+        raise UsageError(f"--model-search {search}: available: {', '.join(models)}")
     trials = options.trials or (BY_FITNESS if options.distance == "phi1" else BY_SENSORS)
     settings = Settings(
         iterations=options.iterations,
@@ -208,7 +208,7 @@ def robot_of(options: BtrOptions, model: Model, task: Walk, space: ControllerSpa
         )
     if options.exchange is not None:
         if options.robot_set:
-            raise UsageError("--robot-set changes a --robot-sim; a real robot is what it is")
+            raise UsageError("--robot-set applies to --robot-sim only")
         return FolderExchange(options.exchange, task, space, model.name, patience=options.wait, say=remark)
     hidden = load_robot(str(options.robot_sim))
     truth = set_parameters(hidden, options.robot_set)
@@ -232,8 +232,8 @@ def _open(out: Path, resume: bool, overwrite: bool) -> Folder:
     there = [out / name for name in KEPT if (out / name).is_dir()]
     if there and not (resume or overwrite):
         raise UsageError(
-            f"--out {out} holds another run ({', '.join(p.name for p in there)}) and it is not touched: --resume goes "
-            "on with it, --overwrite replaces it, or choose another folder"
+            f"--out {out} holds another run ({', '.join(p.name for p in there)}) which is not touched: --resume "
+            "continues it, --overwrite replaces it, or choose another folder"
         )
     folder = open_folder(out, resume=resume, overwrite=overwrite)
     if overwrite:

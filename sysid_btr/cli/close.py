@@ -73,5 +73,5 @@ def declared(robot: Robot, fit: Sequence[str]) -> tuple[str, ...]:
     if fit:
         return tuple(fit)
     chosen = tuple(p for p in DECLARED if p.startswith("mass") or servo_joints(robot))
-    remark(f"freeing {', '.join(chosen)} (--fit says otherwise)")
+    remark(f"fitting {', '.join(chosen)} (choose others by --fit)")
     return chosen

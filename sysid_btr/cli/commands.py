@@ -86,7 +86,7 @@ def _explain(error: Exception) -> int:
     """Say what an error means that is no mistake of the user's; the exit code."""
     if isinstance(error, OSError) and error.errno in OF_THE_DISK:
         where = f" {error.filename}" if error.filename else ""
-        remark(f"error: cannot write{where}: {error.strerror}; make room, or choose a folder you may write to")
+        remark(f"error: cannot write{where}: {error.strerror}; free some space, or choose a writable folder")
         return UsageError.exit_code
     remark(
         f"internal error: {type(error).__name__}: {error}\n"

@@ -104,7 +104,7 @@ def excite(options: ExciteOptions) -> int:
     remark(f"motion: {folder.path / outcome.MOTION}. {outcome.WARNING}")
     if outcome.interrupted(found):
         raise InterruptedRun(
-            "interrupted; the best motion so far is written, and the same command with --resume goes on searching"
+            "interrupted; the best motion so far is written, repeat the command with --resume to continue the search"
         )
     return exit_code(result)
 

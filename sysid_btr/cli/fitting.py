@@ -47,7 +47,7 @@ class Keeper:
 
         if options.out is None:
             if options.resume:
-                raise UsageError("--resume goes on with the journal of an earlier run: give its --out folder")
+                raise UsageError("--resume continues from the journal of an earlier run: give its --out folder")
             return cls(None, Journal())
         folder = open_folder(options.out, resume=options.resume, overwrite=options.overwrite)
         return cls(folder, Journal(folder.journal, fingerprint=fingerprint(verb, options, robot)))
@@ -55,10 +55,10 @@ class Keeper:
     def interrupted(self, progress: ProgressLine) -> str:
         """What is kept of a run that was interrupted."""
         if self.folder is None:
-            return "interrupted; nothing is kept without --out"
+            return "interrupted; without --out nothing is kept"
         return (
             f"interrupted at loss {progress.best:.4g}; {self.journal.evaluations} replays are kept in "
-            f"{self.folder.journal}: the same command with --resume goes on from there"
+            f"{self.folder.journal}: repeat the command with --resume to continue"
         )
 
 
@@ -144,7 +144,8 @@ def _draw(folder: Folder, outcome: Fit | Closing, result: dict[str, Any]) -> Non
     except CannotRenderError as error:
         remark(
             f"no pictures: nothing here draws off-screen ({error}). Install a software driver (Debian, Ubuntu: "
-            "libegl1 and libgl1-mesa-dri, or libosmesa6) or name a working one in MUJOCO_GL; all else is written."
+            "libegl1 and libgl1-mesa-dri, or libosmesa6) or name a working one in MUJOCO_GL; everything else is "
+            "written."
         )
         return
     remark(f"pictures: {', '.join(map(str, pictures))}")

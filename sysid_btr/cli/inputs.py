@@ -63,8 +63,8 @@ def read_logs(paths: Iterable[Path], *, motions: bool = False) -> list[Log]:
             continue
         if log.is_motion and not motions:
             problems.append(
-                f"{path} is a motion to be played, not a recording: play it on the robot, and give the log of what its "
-                "sensors said"
+                f"{path} is an excitation trajectory, not a recording: execute it on the robot, and give the log of "
+                "its sensors"
             )
         logs.append(log)
     if problems:
@@ -112,7 +112,7 @@ def _what_can_be_freed(robot: Robot) -> str:
     for name, cls in {**FIELDS, **robot.fields}.items():
         fields.setdefault(cls.scope, []).append(name)
     lines = [
-        f"what shall be fitted? Give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has",
+        f"no parameters to fit: give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has",
     ]
     for scope, names in (
         ("body", body_names(robot)),
@@ -146,7 +146,7 @@ def initial_values(
             i for i, p in enumerate(parameters) if fnmatchcase(p.name, name)
         ]
         if not chosen:
-            problems.append(f"{name} is not a free parameter; there are {', '.join(p.name for p in parameters)}")
+            problems.append(f"{name} is not a fitted parameter; available: {', '.join(p.name for p in parameters)}")
         for i in chosen:
             p = parameters[i]
             if not p.lower <= value <= p.upper:
@@ -165,7 +165,7 @@ def _known(path: Path | None, robot: Robot, parameters: Sequence[Parameter]) -> 
 
     given, unused = starts_from(read_params(path, robot), parameters)
     if unused:
-        remark(f"--params: not free here, and so not used: {', '.join(unused)}")
+        remark(f"--params: not fitted here, so not used: {', '.join(unused)}")
     return given
 
 
@@ -176,7 +176,7 @@ def output_file(out: Path | None, sources: Sequence[Path], overwrite: bool) -> P
     if out.is_dir():
         raise UsageError(f"--out {out} is a folder; give the name of a file in it")
     if any(out.exists() and source.exists() and out.samefile(source) for source in sources):
-        raise UsageError(f"--out {out} is also read, and is not overwritten; choose another name")
+        raise UsageError(f"--out {out} is also an input, and is not overwritten; choose another name")
     if out.exists() and not overwrite:
         raise UsageError(f"--out {out} exists; --overwrite replaces it, or choose another name")
     if not out.parent.is_dir():

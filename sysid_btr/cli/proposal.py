@@ -159,14 +159,14 @@ def _what_the_log_holds(log: Log, joints: Sequence[JointSeen]) -> Iterator[str]:
 
 def _use(log: Log, channel: str) -> str:
     if channel == "command":
-        how = "each held until the next" if log.meta.command_hold == "zoh" else "interpolated"
-        return f"what the replay is driven with, {how}"
+        how = "zero-order hold" if log.meta.command_hold == "zoh" else "interpolated"
+        return f"drives the replay, {how}"
     if channel in FITTED:
         floors = [noise_floor(log.channels[f"{channel}.{n}"]).sigma for n in log.joints(channel)]
         return f"fitted, because it is measured (noise {np.median(floors):.2g})"
     if channel in COMPARED:
         return "compared with the replay, and not fitted: it is usually the position's, filtered"
-    return "read by models and effects that know it"
+    return "used by the models and effects that need it"
 
 
 # --- what to run -----------------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def _from_table(robot: Robot) -> Iterator[tuple[str, str]]:
             parse_parameters([expression], robot)
         except UsageError:
             continue
-        yield expression, f"the model's own table seeks it between {low:g} and {high:g}"
+        yield expression, f"the model's table bounds it by {low:g} and {high:g}"
 
 
 def _masses(model: mujoco.MjModel, moving: Sequence[str], free: bool) -> Iterator[tuple[str, str]]:
@@ -261,7 +261,7 @@ def _gains(model: mujoco.MjModel, moving: Sequence[str]) -> Iterator[tuple[str, 
 
 def _others(moving: Sequence[str]) -> Iterator[tuple[str, str]]:
     glob = ",".join(moving[:2]) or "*"
-    yield f"kp:{glob}", "each servo for itself"
+    yield f"kp:{glob}", "each servo by itself"
     yield f"frictionloss:{glob}", "dry friction, Nm (N); `close` finds by itself whether it is missing"
     yield f"damping:{glob}", "viscous friction, Nm s/rad (N s/m)"
     yield f"armature:{glob}", "inertia of the rotor behind the gear, kg m2 (kg)"

@@ -125,7 +125,7 @@ def _rehearse(
     from sysid_btr.report.motion import reach, reach_table
 
     if not all(one.is_motion for one in motions):
-        raise UsageError("--log: motions to be played and recordings; give one or the other")
+        raise UsageError("--log: give either excitation trajectories or recordings, not both")
     found = {}
     for path, one in zip_longest(targets, motions):
         predicted = replay_log(robot, one, model, numerics=numerics, threads=options.threads)
@@ -137,7 +137,7 @@ def _rehearse(
         return
     screen = console(sys.stdout)
     for name, joints in found.items():
-        screen.print(f"{name}: a motion that was not recorded: played in the model, with nothing to compare")
+        screen.print(f"{name}: an excitation trajectory: simulated, with no recording to compare with")
         screen.print(reach_table(joints))
 
 
@@ -147,7 +147,7 @@ def _targets(out: Path | None, logs: Sequence[Log], overwrite: bool) -> list[Pat
         return []
     targets = [out / f"{log.path.stem if log.path else 'log'}.replayed.parquet" for log in logs]
     if len(set(targets)) < len(targets):
-        raise UsageError("two logs have the same file name, and so would their replays: run them one by one")
+        raise UsageError("two logs have the same file name, so their replays would, too: run them one by one")
     there = [str(path) for path in targets if path.exists()]
     if there and not overwrite:
         raise UsageError(f"{', '.join(there)} exists; --overwrite replaces it, or choose another --out")

@@ -57,7 +57,7 @@ def read_study_file(path: Path, known: Mapping[str, Option]) -> dict[str, Any]:
 def _problems(key: str, value: Any, known: Mapping[str, Option]) -> list[str]:
     if key not in known:
         close = difflib.get_close_matches(key, known, n=1)
-        return [f"{key}: no such key{f'; did you mean {close[0]}?' if close else ''}"]
+        return [f"{key}: unknown key{f'; did you mean {close[0]}?' if close else ''}"]
     kind = known[key].kind
     return [f"{key}{place}: {value!r} is not allowed; expected {kind.expected}" for place in kind.wrong(value)]
 
