@@ -585,7 +585,10 @@ def check_by_residuals(estimator: Estimator) -> None:
     allowed = whole.loss * (1.0 + 2.0 * gain / len(_decay().residuals(whole.x[None])[0]))
     for variant in (estimator.for_rough_objective(1e-2, gain), estimator.unconfirmed()):
         require(uses_residuals(variant), f"{estimator.name}: a variant of it does not use residuals")
-        require(run(variant, _decay()).loss <= allowed, f"{estimator.name}: a variant of it stops far from the minimum")
+        found = run(variant, _decay()).loss
+        # settings under which the estimator itself stops on the way say nothing of where its variants end
+        near = found <= allowed if whole.converged else found < float(_decay().loss(_decay().start[None])[0])
+        require(near, f"{estimator.name}: a variant of it stops far from the minimum")
 
 
 ESTIMATOR_CHECKS: tuple[Callable[[Estimator], None], ...] = (

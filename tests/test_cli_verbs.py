@@ -337,11 +337,11 @@ def test_close_names_the_effect_and_resumes(cli: Cli, bench: Path, tmp_path: Pat
     assert json.loads(again.out)["effects"] == result["effects"]
 
 
-def test_close_without_fit_says_what_it_frees(cli: Cli, bench: Path) -> None:
+def test_close_without_fit_says_what_it_fits(cli: Cli, bench: Path) -> None:
     asked = ("--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--effects", "coulomb_friction")
     answer = cli("close", *asked)
     assert answer.code == 0
-    assert "freeing mass:*, kp:*=shared" in answer.err
+    assert "fitting mass:*, kp:*=shared" in answer.err
     assert "nothing missing" in answer.out
 
 

@@ -343,9 +343,9 @@ def test_what_cannot_be_used_is_said(
     assert said in capsys.readouterr().err
 
 
-def test_a_reference_that_was_free_to_move_is_refused() -> None:
+def test_a_floating_base_reference_is_refused() -> None:
     log = read_log(CLEAN)
-    with pytest.raises(UsageError, match="free to move"):
+    with pytest.raises(UsageError, match="floating-base log"):
         design(load_robot(str(LEG)), ("kp:*=shared",), reference=replace(log, meta=replace(log.meta, mount="free")))
 
 

@@ -68,11 +68,12 @@ def test_poses_are_those_of_log_and_replay(fitted: Any) -> None:
 
 
 def test_missing_samples_are_bridged(fitted: Any) -> None:
-    log = fitted.study.holdout[0].log
+    [episode] = fitted.study.holdout
+    log = episode.log
     holes = log.channels["position.pendulum"].copy()
     holes[100:120] = np.nan
     patched = replace(log, channels={**log.channels, "position.pendulum": holes})
-    scene = scene_of(replace(fitted, study=replace(fitted.study, holdout=(patched,))))
+    scene = scene_of(replace(fitted, study=replace(fitted.study, holdout=(replace(episode, recording=patched),))))
     assert np.isfinite(scene.poses["log"]).all()
 
 

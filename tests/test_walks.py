@@ -422,7 +422,7 @@ def test_a_fit_by_deferred_correction_is_that_of_the_right_integrator() -> None:
     settings = {"rng": np.random.default_rng(0), "budget": Budget(), "journal": Journal(), "progress": silent}
     cheap = Numerics("implicitfast", 0.005)
     wrong = LeastSquares().fit(problem.with_numerics(cheap), **settings).x
-    found = deferred_fit(problem, cheap, LeastSquares(), **{**settings, "journal": Journal()})
+    found = deferred_fit(problem, cheap, LeastSquares(), step=1e-3, **{**settings, "journal": Journal()})
     assert np.abs(found.x - [1.3, 0.9]).max() < 1e-3
     assert np.abs(wrong - [1.3, 0.9]).max() > 5 * np.abs(found.x - [1.3, 0.9]).max()
     assert found.residual is not None
