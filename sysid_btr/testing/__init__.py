@@ -1,0 +1,64 @@
+"""For those who extend sysid_btr: toy problems with known answers, and the checks that every extension must pass.
+
+>>> from sysid_btr.estimators import get_estimator
+>>> from sysid_btr.testing import check_estimator
+>>> check_estimator(get_estimator("lsq"))
+"""
+
+from sysid_btr.testing.estimator import (
+    ESTIMATOR_CHECKS,
+    Killed,
+    Witness,
+    check_budget,
+    check_by_residuals,
+    check_estimator,
+    check_failing_candidates,
+    check_interruption,
+    check_progress,
+    check_refusals,
+    check_reproducible,
+    check_result,
+    check_resume,
+    require,
+    run,
+)
+from sysid_btr.testing.problems import (
+    LossOnly,
+    ToyProblem,
+    bound_active,
+    exponential_decay,
+    failing_region,
+    hopeless,
+    linear_gaussian,
+    lone_parameter,
+    rank_deficient,
+    rosenbrock,
+)
+
+__all__ = [
+    "ESTIMATOR_CHECKS",
+    "Killed",
+    "LossOnly",
+    "ToyProblem",
+    "Witness",
+    "bound_active",
+    "check_budget",
+    "check_by_residuals",
+    "check_estimator",
+    "check_failing_candidates",
+    "check_interruption",
+    "check_progress",
+    "check_refusals",
+    "check_reproducible",
+    "check_result",
+    "check_resume",
+    "exponential_decay",
+    "failing_region",
+    "hopeless",
+    "linear_gaussian",
+    "lone_parameter",
+    "rank_deficient",
+    "require",
+    "rosenbrock",
+    "run",
+]
