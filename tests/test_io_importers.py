@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._check_units import _CONVERSIONS
-from sysid_btr.io.importers import KnownModel, Recording, Signal, available, get_importer, import_log
+from sysid_btr.io.importers import KnownModel, get_importer, import_log
 from sysid_btr.io.importers.align import Series, on_clock
 from sysid_btr.io.importers.base import MappingNeeded
 from sysid_btr.io.importers.guess import guess
@@ -34,6 +34,7 @@ from sysid_btr.io.importers.units import SI, find, resolve
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import write_log
 from sysid_btr.io.validation import validate_log
+from sysid_btr.testing import check_importer
 
 MODEL = KnownModel("toy", GOOD_JOINTS, dict.fromkeys(GOOD_JOINTS, (-1.0, 1.0)))
 
@@ -1268,36 +1269,29 @@ def test_a_broken_dataset_is_told(
 # --- registry ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Diary:
-    """A format of somebody else's."""
+def written(kind: str, tmp_path: Path, good: Log) -> tuple[Path, ImportMap]:
+    """A source of a format, and what has to be said about it."""
+    if kind in ("ros2", "ros2 file"):
+        folder = write_bag(Ros(), tmp_path / "bag", conversation(Ros(), good))
+        return (folder if kind == "ros2" else next(folder.glob("*.db3"))), told(**ORDER)
+    if kind == "mcap":
+        return json_mcap(tmp_path / "log.mcap", good), told()
+    if kind == "lerobot":
+        return write_lerobot(tmp_path / "set", good, names=LEROBOT_NAMES), told()
+    frame = nao_frame(good) if kind == "naoqi" else plain_frame(good)
+    path = tmp_path / ("log.parquet" if kind == "parquet" else "log.csv")
+    if kind == "parquet":
+        frame.to_parquet(path)
+    else:
+        frame.to_csv(path, index=False)
+    return path, told()
 
-    name: str = "diary"
-    title: str = "a diary"
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        return head.startswith(b"Dear diary")
-
-    def read(self, path: Path, told: ImportMap) -> Recording:
-        time = np.arange(50) * 0.02
-        signals = (Signal("told", "command.a", np.sin(time)), Signal("done", "position.a", np.sin(time)))
-        return Recording(path, time, signals, remarks=("dear",))
-
-
-def test_others_may_bring_importers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from importlib.metadata import EntryPoint
-
-    entry = EntryPoint("diary", f"{__name__}:Diary", ENTRY_POINTS)
-    monkeypatch.setattr(EntryPoint, "load", lambda self: Diary)
-    monkeypatch.setattr(
-        "importlib.metadata.entry_points", lambda *, group: [entry] if group == ENTRY_POINTS else []
-    )
-    assert "diary" in available()
-    (tmp_path / "log").write_text("Dear diary, today I moved.\n")
-    assert recognise(tmp_path / "log").name == "diary"
-    imported = import_log([tmp_path / "log"])
-    assert imported.log.joints("position") == ("a",)
-    assert "dear" in imported.remarks
+@pytest.mark.parametrize("kind", ["naoqi", "ros2", "ros2 file", "mcap", "lerobot", "csv", "parquet"])
+def test_every_importer_keeps_the_contract(tmp_path: Path, good: Log, kind: str) -> None:
+    pytest.importorskip("rosbags")
+    source, said = written(kind, tmp_path, good)
+    check_importer(recognise(source), source, said)
 
 
 def test_one_that_cannot_be_loaded_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,9 +19,9 @@ from sysid_btr.testing.estimator import (
     check_reproducible,
     check_result,
     check_resume,
-    require,
     run,
 )
+from sysid_btr.testing.importer import IMPORTER_CHECKS, check_importer
 from sysid_btr.testing.problems import (
     LossOnly,
     ToyProblem,
@@ -34,9 +34,11 @@ from sysid_btr.testing.problems import (
     rank_deficient,
     rosenbrock,
 )
+from sysid_btr.testing.require import require
 
 __all__ = [
     "ESTIMATOR_CHECKS",
+    "IMPORTER_CHECKS",
     "Killed",
     "LossOnly",
     "ToyProblem",
@@ -46,6 +48,7 @@ __all__ = [
     "check_by_residuals",
     "check_estimator",
     "check_failing_candidates",
+    "check_importer",
     "check_interruption",
     "check_progress",
     "check_refusals",

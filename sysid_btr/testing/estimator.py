@@ -36,6 +36,7 @@ from sysid_btr.testing.problems import (
     rank_deficient,
     rosenbrock,
 )
+from sysid_btr.testing.require import require
 
 _SEED = 20
 _EVALUATIONS = 240
@@ -142,12 +143,6 @@ def run(
         journal=Journal() if journal is None else journal,
         progress=progress,
     )
-
-
-def require(condition: bool, promise: str) -> None:
-    """Raise AssertionError with the promise that was broken."""
-    if not condition:
-        raise AssertionError(promise)
 
 
 def _problems() -> tuple[ToyProblem, ...]:

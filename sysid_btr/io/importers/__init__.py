@@ -8,11 +8,13 @@
 from __future__ import annotations
 
 from sysid_btr.io.importers.base import Importer, Recording, Signal
+from sysid_btr.io.importers.mapping import ImportMap
 from sysid_btr.io.importers.registry import ENTRY_POINTS, available, get_importer
 from sysid_btr.io.importers.run import Imported, KnownModel, import_log
 
 __all__ = [
     "ENTRY_POINTS",
+    "ImportMap",
     "Imported",
     "Importer",
     "KnownModel",
