@@ -10,6 +10,7 @@ from sysid_btr.run_folder import DRAWS, RESULT, Folder, open_folder
 
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
+    from sysid_btr.excite.design import Design
     from sysid_btr.identify.fit import Fit
     from sysid_btr.posterior.outcome import Posterior
 
@@ -52,6 +53,27 @@ def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[s
         folder.write(DRAWS, netcdf(outcome))
     result["pictures"] = keep(folder, pictures_of(outcome))
     describe_model(as_model(outcome), result, folder)
+    report = write_report(folder, result)
+    folder.write(RESULT, to_json(result))
+    return report
+
+
+def save_motion(folder: Folder, design: Design, result: dict[str, Any]) -> Path:
+    """Write motion, figure, report and result of a designed motion; the result last, as in `write_all`.
+
+    Returns
+    -------
+    Path
+        The report.
+    """
+    from sysid_btr.excite.outcome import MOTION
+    from sysid_btr.io.parquet import write_log
+    from sysid_btr.report.excitation import plot_motion
+    from sysid_btr.report.pictures import keep, write_report
+    from sysid_btr.result import to_json
+
+    write_log(design.log, folder.path / MOTION, overwrite=True)
+    result["pictures"] = keep(folder, [("excite", lambda: plot_motion(design))])
     report = write_report(folder, result)
     folder.write(RESULT, to_json(result))
     return report

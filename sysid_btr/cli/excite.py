@@ -82,6 +82,7 @@ def excite(options: ExciteOptions) -> int:
     """
     from sysid_btr.excite import outcome
     from sysid_btr.result import exit_code
+    from sysid_btr.saving import save_motion
 
     robot = find_robot(options.model, options.bounds)
     check_freed(robot, options.fit)
@@ -92,7 +93,7 @@ def excite(options: ExciteOptions) -> int:
     reference = read_logs(options.log)[0] if options.log else None
     found, folder = _search(options, robot, reference)
     result = outcome.make_result(found, seed=options.seed)
-    remark(f"report: {outcome.write_all(folder, found, result)}")
+    remark(f"report: {save_motion(folder, found, result)}")
     if options.json:
         print_json(result)
     else:

@@ -1,4 +1,4 @@
-"""A designed motion for users: files, result.json, table and figure."""
+"""A designed motion for users: result.json and table."""
 
 from __future__ import annotations
 
@@ -11,20 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr.estimators.base import Termination
-from sysid_btr.result import SCHEMA, clean, to_json, versions
+from sysid_btr.result import SCHEMA, clean, versions
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from matplotlib.figure import Figure
     from rich.console import RenderableType
 
     from sysid_btr.excite.design import Design
     from sysid_btr.identify.intervals import Estimate
-    from sysid_btr.run_folder import Folder
 
-MOTION, FIGURE = "excite.parquet", "excite"
-MOTORS_SHOWN = 6
+MOTION = "excite.parquet"
 WARNING = (
     "Only the limits of the joints keep this motion from hitting the robot itself or the ground: replay it in a viewer "
     "first, and execute it slowly at first."
@@ -171,57 +166,3 @@ def show(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         f"{result['numerics']['chosen']}",
         style="dim",
     )
-
-
-def plot_motion(design: Design) -> Figure:
-    """The commands of the motors that move most, and the ratio of every interval to the reference's."""
-    from sysid_btr.report.style import FOUND, PLAIN, faint, ink, new_figure
-
-    time, commands = design.family.commands(design.coefficients)
-    motors = design.family.motors
-    order = np.argsort([-np.ptp(q) for q in commands.T], kind="stable")[:MOTORS_SHOWN]
-    names = [e.name for e in design.designed.estimates]
-    figure = new_figure(13, max(1.1 * len(order), 0.3 * len(names)) + 1.2)
-    halves: Any = figure.subfigures(1, 2, width_ratios=(1.5, 1))
-    left, right = halves
-    rows = left.subplots(len(order), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, i in zip(rows, order, strict=True):
-        axis.plot(time, commands[:, i], color=ink(), lw=1)
-        for bound in (motors[i].low, motors[i].high):
-            axis.axhline(bound, color=faint(), lw=0.8, ls="--")
-        axis.set_ylabel(motors[i].joints[0], rotation=0, ha="right", fontsize=8)
-        axis.locator_params(axis="y", nbins=4)
-    rows[0].set_title("commands (rad, m) and their bounds", fontsize=9)
-    rows[-1].set_xlabel("time (s)")
-    axis = right.subplots()
-    place = np.arange(len(names))[::-1]
-    ratios = np.where(design.told, design.ratios, np.nan)
-    axis.barh(place, ratios, color=[FOUND if r <= 1 else PLAIN for r in np.nan_to_num(ratios)])
-    for y, ratio in zip(place, ratios, strict=True):
-        text = f" {ratio:.2f}" if np.isfinite(ratio) else " not identifiable from either"
-        axis.text(ratio if np.isfinite(ratio) else 0.0, y, text, va="center", fontsize=8, color=ink())
-    axis.axvline(1.0, color=faint(), lw=0.8)
-    axis.set_yticks(place, names, fontsize=8)
-    axis.set_ylim(-0.7, len(names) - 0.3)
-    axis.set_xlim(0, 1.15 * max(np.nanmax(ratios, initial=1.0), 1.0))
-    axis.set_title(f"standard error over that of {design.compared_with}", fontsize=9)
-    return figure
-
-
-def write_all(folder: Folder, design: Design, result: dict[str, Any]) -> Path:
-    """Write motion, figure, report and result; the result last, because its presence says that the run is complete.
-
-    Returns
-    -------
-    Path
-        The report.
-    """
-    from sysid_btr.io.parquet import write_log
-    from sysid_btr.report.pictures import keep, write_report
-    from sysid_btr.run_folder import RESULT
-
-    write_log(design.log, folder.path / MOTION, overwrite=True)
-    result["pictures"] = keep(folder, [(FIGURE, lambda: plot_motion(design))])
-    report = write_report(folder, result)
-    folder.write(RESULT, to_json(result))
-    return report
