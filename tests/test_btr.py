@@ -16,7 +16,7 @@ from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
 from sysid_btr.btr.loop import back_to_reality, disengaged
-from sysid_btr.btr.map_problem import Beginnings, model_fit
+from sysid_btr.btr.map_problem import MapProblem, model_fit
 from sysid_btr.btr.outcome import BackToReality, Iteration, estimate_model
 from sysid_btr.btr.problems import ControllerProblem, ModelProblem, Stage
 from sysid_btr.btr.robot import SILENT, HiddenRobot, Noise, Robot, Trial
@@ -352,7 +352,7 @@ def test_what_trials_do_not_tell_stays_as_it_was() -> None:
     unseen = parse_parameters(["damping:LFCoxa"], MODEL)[0]
     free = (*terms(), replace(unseen, places=("LFCoxa",)))
     start = np.array([1.1, 0.9, Terms(free).nominal[2]])
-    problem = Beginnings(trial_study(stage(), [log], [], 1).train_problem(Model.of(free, start)))
+    problem = MapProblem(trial_study(stage(), [log], [], 1).train_problem(Model.of(free, start)))
     candidates = np.vstack([start, start + problem.width])
     residuals = problem.residuals(candidates)
     np.testing.assert_allclose(residuals[:, -3:], [[0, 0, 0], [1, 1, 1]], atol=1e-12)

@@ -14,7 +14,7 @@ import pytest
 import toys
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget, silent
+from sysid_btr.estimators.base import Budget, Derived, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.fit import Fit, fit
@@ -292,32 +292,16 @@ def changed(log: Log, channel: str, by: FloatArray) -> Log:
 
 
 @dataclass(frozen=True)
-class OneByOne:
+class OneByOne(Derived):
     """The same problem, without saying what moves what."""
 
-    whole: ReplayProblem
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.whole.names
-
-    @property
-    def lower(self) -> FloatArray:
-        return self.whole.lower
-
-    @property
-    def upper(self) -> FloatArray:
-        return self.whole.upper
-
-    @property
-    def start(self) -> FloatArray:
-        return self.whole.start
+    problem: ReplayProblem
 
     def residuals(self, candidates: FloatArray) -> FloatArray:
-        return self.whole.residuals(candidates)
+        return self.problem.residuals(candidates)
 
     def loss(self, candidates: FloatArray) -> FloatArray:
-        return self.whole.loss(candidates)
+        return self.problem.loss(candidates)
 
 
 def test_coloured_jacobian_is_that_of_plain_differences() -> None:

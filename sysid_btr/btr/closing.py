@@ -152,7 +152,7 @@ def _tell_apart(study: Study, found: Model, declared: int, left: float) -> tuple
     The first `declared` terms stay; `left` is the mean squared held-out error so far. Returned with that of the model,
     and the candidates that it took.
     """
-    from sysid_btr.btr.map_problem import Beginnings, model_fit
+    from sysid_btr.btr.map_problem import MapProblem, model_fit
     from sysid_btr.identify.refit import judge
 
     spent = 0
@@ -160,7 +160,7 @@ def _tell_apart(study: Study, found: Model, declared: int, left: float) -> tuple
         if not (isinstance(effect, Effect) and effect.shared):
             continue
         trying = found.replaced(effect, (_own_amounts(effect), np.tile(found.own(effect), len(effect.places))))
-        problem = Beginnings(study.train_problem(trying))
+        problem = MapProblem(study.train_problem(trying))
         estimate = model_fit().fit(
             problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
         )

@@ -22,7 +22,7 @@ from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
-from sysid_btr.btr.map_problem import Beginnings
+from sysid_btr.btr.map_problem import MapProblem
 from sysid_btr.btr.outcome import BackToReality, Iteration
 from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
@@ -229,13 +229,13 @@ class _Loop:
             return None
         if problem.distance != FITNESS and not problem.targets:
             return None
-        asked: ModelProblem | Beginnings = problem
+        asked: ModelProblem | MapProblem = problem
         if problem.distance == LIKELIHOOD:
             logs = early_logs(self.stage, self._remembered(), self.settings.memory)
             if not logs:
                 return None
             study = trial_study(self.stage, logs, (), self.threads)
-            asked = Beginnings(study.train_problem(Model.of(self.stage.world.terms, problem.start)), self._beginning)
+            asked = MapProblem(study.train_problem(Model.of(self.stage.world.terms, problem.start)), self._beginning)
         found, journal = self._search(number, step, self.settings.models, asked)
         if not np.isfinite(found.loss):
             return None

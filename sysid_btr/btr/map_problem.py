@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.estimators.base import Derived
 from sysid_btr.estimators.chain import Chain
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.objectives.problem import ReplayProblem
@@ -19,49 +20,33 @@ FAR = 5e-2
 
 
 @dataclass(frozen=True, eq=False)
-class Beginnings:
-    """Step 3 by a likelihood: the trials' beginnings, biased by the last model.
+class MapProblem(Derived):
+    """Step 3 by a likelihood: the beginnings of the trials, biased by the last model (maximum a posteriori).
 
-    The bias is a Gaussian prior about the last model, and keeps what a few trials do not tell where it was.
+    The bias is a Gaussian prior about the last model: parameters about which a few trials are not informative stay
+    where they were.
 
     Attributes
     ----------
-    data : the fitted trials of a study; it begins at the last model.
+    problem : the fitted trials of a study; it begins at the last model.
     share : of a whole trial that is simulated.
     """
 
-    data: ReplayProblem
+    problem: ReplayProblem
     share: float = 1.0
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self.data.names
-
-    @property
     def runs(self) -> float:
-        return self.share * len(self.data.episodes)
-
-    @property
-    def lower(self) -> FloatArray:
-        return self.data.lower
-
-    @property
-    def upper(self) -> FloatArray:
-        return self.data.upper
-
-    @property
-    def start(self) -> FloatArray:
-        """(p,) the last model."""
-        return self.data.start
+        return self.share * len(self.problem.episodes)
 
     @cached_property
     def width(self) -> FloatArray:
         """(p,) standard deviation of the prior."""
-        return np.maximum(PULL * np.abs(self.start), self.data.scale)
+        return np.maximum(PULL * np.abs(self.start), self.problem.scale)
 
     def residuals(self, candidates: FloatArray) -> FloatArray:
         """Whitened residuals (m, r + p) of candidates (m, p); those of the prior come last."""
-        residuals = self.data.residuals(candidates)
+        residuals = self.problem.residuals(candidates)
         pull = (np.atleast_2d(candidates) - self.start) / self.width
         pull[np.isnan(residuals).any(axis=1)] = np.nan
         return np.hstack([residuals, pull])

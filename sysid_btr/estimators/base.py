@@ -57,6 +57,29 @@ class ResidualProblem(Problem, Protocol):
         ...
 
 
+class Derived:
+    """Base of a problem that asks another one, `problem`, about the same parameters."""
+
+    problem: Problem
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those of the other one, as are bounds and start."""
+        return self.problem.names
+
+    @property
+    def lower(self) -> FloatArray:
+        return self.problem.lower
+
+    @property
+    def upper(self) -> FloatArray:
+        return self.problem.upper
+
+    @property
+    def start(self) -> FloatArray:
+        return self.problem.start
+
+
 @dataclass(frozen=True)
 class Budget:
     """What a fit may spend; None means no limit.

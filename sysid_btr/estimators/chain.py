@@ -9,6 +9,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import (
     Budget,
+    Derived,
     Estimator,
     FitResult,
     Problem,
@@ -174,27 +175,19 @@ def _joined(before: FitResult, after: FitResult) -> FitResult:
     )
 
 
-class _From:
+@dataclass(frozen=True, eq=False)
+class _From(Derived):
     """A problem with another start; whatever else it offers is passed on."""
 
-    def __init__(self, problem: Problem, start: FloatArray) -> None:
-        self._problem = problem
-        self.start = start
+    problem: Problem
+    point: FloatArray
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self._problem.names
-
-    @property
-    def lower(self) -> FloatArray:
-        return self._problem.lower
-
-    @property
-    def upper(self) -> FloatArray:
-        return self._problem.upper
+    def start(self) -> FloatArray:
+        return self.point
 
     def loss(self, candidates: FloatArray) -> FloatArray:
-        return self._problem.loss(candidates)
+        return self.problem.loss(candidates)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._problem, name)
+        return getattr(self.problem, name)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.estimators.base import Budget, FitResult, Progress, ResidualEstimator, Termination
+from sysid_btr.estimators.base import Budget, Derived, FitResult, Progress, ResidualEstimator, Termination
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.objectives.problem import ReplayProblem
@@ -30,45 +30,38 @@ again."""
 
 
 @dataclass(frozen=True, eq=False)
-class Corrected:
+class Corrected(Derived):
     """A problem under a cheap integrator, with the right residuals at one point.
 
     Attributes
     ----------
-    cheap : the problem under the cheap integrator.
+    problem : under the cheap integrator.
     right : (r,) the right residuals at the point.
     offset : (r,) what the cheap ones lack there.
-    start : (p,) the point.
+    point : (p,).
     """
 
-    cheap: ReplayProblem
+    problem: ReplayProblem
     right: FloatArray
     offset: FloatArray
-    start: FloatArray
+    point: FloatArray
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self.cheap.names
-
-    @property
-    def lower(self) -> FloatArray:
-        return self.cheap.lower
-
-    @property
-    def upper(self) -> FloatArray:
-        return self.cheap.upper
+    def start(self) -> FloatArray:
+        """(p,) the point."""
+        return self.point
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """See `ReplayProblem.groups`."""
-        return self.cheap.groups
+        return self.problem.groups
 
     def support(self, parameter: int) -> BoolArray | None:
         """See `ReplayProblem.support`."""
-        return self.cheap.support(parameter)
+        return self.problem.support(parameter)
 
     def residuals(self, candidates: FloatArray) -> FloatArray:
-        return self.cheap.residuals(candidates) + self.offset
+        return self.problem.residuals(candidates) + self.offset
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         return np.asarray(np.sum(self.residuals(candidates) ** 2, axis=1))

@@ -14,6 +14,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import (
     Budget,
+    Derived,
     Estimator,
     FitResult,
     Problem,
@@ -48,7 +49,7 @@ class Killed(BaseException):
 
 
 @dataclass(eq=False)
-class Witness:
+class Witness(Derived):
     """A problem that remembers what it was asked, and may raise instead of answering.
 
     Attributes
@@ -66,26 +67,6 @@ class Witness:
     fault: BaseException | None = None
     answered: list[FloatArray] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameter names."""
-        return self.problem.names
-
-    @property
-    def lower(self) -> FloatArray:
-        """Lower bounds."""
-        return self.problem.lower
-
-    @property
-    def upper(self) -> FloatArray:
-        """Upper bounds."""
-        return self.problem.upper
-
-    @property
-    def start(self) -> FloatArray:
-        """Start."""
-        return self.problem.start
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         """Losses, remembered."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Problem
+from sysid_btr.estimators.base import Derived, Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,30 +40,10 @@ class ToyProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class LossOnly:
+class LossOnly(Derived):
     """A problem without residuals."""
 
     problem: Problem
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameter names."""
-        return self.problem.names
-
-    @property
-    def lower(self) -> FloatArray:
-        """Lower bounds."""
-        return self.problem.lower
-
-    @property
-    def upper(self) -> FloatArray:
-        """Upper bounds."""
-        return self.problem.upper
-
-    @property
-    def start(self) -> FloatArray:
-        """Start."""
-        return self.problem.start
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         """Losses of the problem."""
