@@ -51,7 +51,7 @@ def import_log(
     LogError
         If a source cannot be read or understood.
     UsageError
-        If what is told does not fit, or a package is missing.
+        If what is said does not fit, or a package is missing.
     """
     from sysid_btr.io.importers.mapping import read_map, with_flags
     from sysid_btr.io.importers.run import import_log as read

@@ -95,12 +95,12 @@ def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def exit_code(result: Mapping[str, Any]) -> int:
-    """0, or 5 where a finished run told nothing: not converged, or not one parameter or effect identifiable.
+    """0, or 5 where a finished run identified nothing: not converged, or not one parameter or effect identifiable.
 
     A parameter that the log cannot tell beside others that it can is a finding, not a failure.
     """
     if result.get("converged") is False:
         return 5
     parameters = result["parameters"]
-    told = any(p["identifiable"] != "no" for p in parameters)
-    return 5 if parameters and not told and not result["effects"] else 0
+    identifiable = any(p["identifiable"] != "no" for p in parameters)
+    return 5 if parameters and not identifiable and not result["effects"] else 0

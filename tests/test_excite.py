@@ -269,7 +269,7 @@ def test_what_no_motion_tells_is_said() -> None:
     by_name = {e.name: e for e in found.designed.estimates}
     assert by_name["mass:HipRoll"].identifiable == "no"
     assert by_name["mass:HipRoll"].reason
-    assert found.told == [True, True, False, True]
+    assert found.identifiable == [True, True, False, True]
 
 
 def test_an_interrupted_search_gives_its_best_and_can_be_resumed(tmp_path: Path) -> None:

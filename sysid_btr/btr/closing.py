@@ -141,8 +141,8 @@ def _look(
     found, last, apart = _tell_apart(study, closing.model, len(free.terms), last)
     joining, spent = found.without(*free.terms), spent + apart * len(logs)
     fitted = [(term, found.own(term) if term in found.terms else own) for term, own in declared.parts]
-    told = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
-    message = f"added to the model: {told}; {_score(first, last)}"
+    added = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
+    message = f"added to the model: {added}; {_score(first, last)}"
     return Joined(message, Model.joined([*fitted, *joining.parts]), spent), study
 
 

@@ -56,7 +56,7 @@ class FolderExchange:
     robot : name of the robot, for the log.
     poll : s between looks for a reply.
     patience : s after which `InterruptedRun` is raised; None waits for ever.
-    say : told what is waited for.
+    say : called with what is waited for.
     """
 
     folder: Path
@@ -81,7 +81,7 @@ class FolderExchange:
         self._ask(place, controller)
         began = time.monotonic()
         refused: tuple[float, ...] = ()
-        told = False
+        said = False
         while True:
             reply = place / REPLY
             state = _stamps(reply, place / RECORDED)
@@ -93,9 +93,9 @@ class FolderExchange:
                 refused = state
                 Folder(place).write(PROBLEMS, "\n".join(problems) + "\n")
                 self.say(f"{place}: the reply cannot be used:\n  " + "\n  ".join(problems))
-            if not told:
+            if not said:
                 self.say(f"execute {place / COMMAND}, then put {RECORDED} and, last, {REPLY} next to it")
-                told = True
+                said = True
             if self.patience is not None and time.monotonic() - began >= self.patience:
                 raise InterruptedRun(
                     f"{place}: no usable reply after {self.patience:g} s; everything is kept, and the same command "

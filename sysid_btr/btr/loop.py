@@ -41,7 +41,7 @@ from sysid_btr.version import __version__
 
 PATIENCE = 3
 """Iterations without progress after which disengagement is looked for."""
-UNTOLD = 0.2
+UNCORRELATED = 0.2
 """Rank correlation of expected and real fitness up to which the model does not tell which controller is better."""
 STUCK = 0.9
 """What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
@@ -78,7 +78,7 @@ def back_to_reality(
     seed : of all random numbers.
     folder : where journals and trials are kept; a run that finds its own goes on with them. None keeps nothing.
     threads : worker threads, 0 for all cores.
-    progress, say : told of evaluations, and of what was found.
+    progress, say : called after evaluations, and with what was found.
     fingerprint : of what else decides which simulations are run: the robot, of which nothing is known here.
 
     Raises
@@ -242,7 +242,7 @@ class _Loop:
         if problem.distance == LIKELIHOOD:
             last, new = replace(problem, distance=FITNESS).loss(np.stack([problem.start, found.x]))
             if not np.isfinite(new) or new > SPOILT * last:
-                return problem.start, journal  # what comes later in the trials tells against it
+                return problem.start, journal  # what comes later in the trials speaks against it
         self.values = found.x
         candidates, losses = _all_of(journal)
         order = np.argsort(losses, kind="stable")
@@ -330,7 +330,7 @@ def disengaged(rounds: Sequence[Iteration]) -> str:
     """Why the two searches have lost hold of each other, if they have; else nothing.
 
     In the last `PATIENCE` iterations nothing better was found on the robot, and the order in which the model puts
-    controllers tells nothing of the order in which the robot does: selection in one has no influence in the other.
+    controllers says nothing of the order in which the robot does: selection in one has no influence in the other.
     """
     if len(rounds) <= PATIENCE or rounds[-1].best > rounds[-1 - PATIENCE].best:
         return ""
@@ -343,13 +343,14 @@ def disengaged(rounds: Sequence[Iteration]) -> str:
         return f"Disengaged: the last {PATIENCE} iterations found no controller that had not been tried before."
     if len(tried) < 2 * PATIENCE or np.ptp(real) == 0:
         return ""
-    told = _rank_correlation(expected, real)
-    if told > UNTOLD:
+    correlation = _rank_correlation(expected, real)
+    if correlation > UNCORRELATED:
         return ""
     return (
         f"Disengaged: nothing better was found on the robot in {PATIENCE} iterations, and the model does not "
-        f"predict which controller is better there (rank correlation {told:.2f} over {len(tried)} trials). The model "
-        "lacks something that the robot has: declare other parameters, or search for missing effects (--close)."
+        f"predict which controller is better there (rank correlation {correlation:.2f} over {len(tried)} trials). "
+        "The model lacks something that the robot has: declare other parameters, or search for missing effects "
+        "(--close)."
     )
 
 

@@ -1,4 +1,4 @@
-"""The robot as an interface: something that plays a controller and tells what happened."""
+"""The robot as an interface: something that executes a controller and reports what happened."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class HiddenRobot:
         log = self._log(outputs.base[0], outputs.position[0], commands[0], sensors, rng)
         fitness = float(self.task.fitness(outputs.base)[0]) + self.noise.fitness * rng.normal()
         if down.any():
-            # what lies on the ground tells little: the recording stops there
+            # what lies on the ground is hardly informative: the recording stops there
             return Trial(log.window(0, max(int(np.argmax(down)), 2)), fitness, "fallen")
         return Trial(log, fitness, "done")
 

@@ -42,7 +42,7 @@ def cma_controller_searches(generations: int = 11) -> tuple[CmaEs, CmaEs]:
 
 
 def model_search() -> CmaEs:
-    """Step 3 with as many models as in the paper's Fig. 3, 11 generations of 15, but told apart more finely."""
+    """Step 3 with as many models as in the paper's Fig. 3, 11 generations of 15, but distinguished more finely."""
     return CmaEs(population=15, max_generations=11, sigma=0.15)
 
 

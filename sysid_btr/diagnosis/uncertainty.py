@@ -19,7 +19,7 @@ def with_intervals(state: State, rules: Selection) -> State:
     """The state with estimates of all parameters, and with the model as it is reported.
 
     The step is halved while it moves an estimate by more than its error. The fitted model stays where the residuals are
-    least, also where the motion of walks tells more than these do.
+    least, also where the motion of walks is more informative than these are.
     """
     study = state.study
     for refinement in range(rules.refinements + 1):

@@ -45,9 +45,9 @@ def _lines(group: Sequence[Entry]) -> Iterator[str]:
         yield from (c["line"] for c in group)
         return
     names = f": {', '.join(c['name'] for c in group)}" if len(group) <= MOST_NAMES else ""
-    told = first["certainty"] or (f" (x{factor:.4g})" if factor is not None else "")
+    certainty = first["certainty"] or (f" (x{factor:.4g})" if factor is not None else "")
     span = first["line"].split(f" {first['attribute']} ", 1)[1].removesuffix(first["certainty"])
-    yield f"{len(group)} {first['kind']}s {first['attribute']}{told}, as {first['name']} {span}{names}"
+    yield f"{len(group)} {first['kind']}s {first['attribute']}{certainty}, as {first['name']} {span}{names}"
 
 
 def _factor(change: Entry) -> float | None:

@@ -69,7 +69,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield parameters_table(estimates)
         for p in estimates:
             if p["reason"]:
-                yield Text(f"  {p['name']}: {told(p)}: {p['reason']}")
+                yield Text(f"  {p['name']}: {identifiability(p)}: {p['reason']}")
     yield from (Text(line) for line in model_lines(result))
     if result.get("verdict") in ("ambiguous", "unexplained") and result.get("candidates"):
         yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
@@ -151,7 +151,7 @@ def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
             number(p["std"], 2) if known else "-",
             " .. ".join(with_digits_of(end, p["std"]) for end in p["ci95"]) if known else "-",
             "x nominal" if p["unit"] == "1" else p["unit"],
-            told(p),
+            identifiability(p),
         )
     return table
 
@@ -188,7 +188,7 @@ def joints_table(joints: Mapping[str, float], unit: str) -> Table:
     return table
 
 
-def told(parameter: Mapping[str, Any]) -> str:
+def identifiability(parameter: Mapping[str, Any]) -> str:
     """Whether a parameter is identifiable, in words."""
     words = {"yes": "yes", "weak": "weakly", "no": "not identifiable"}[parameter["identifiable"]]
     return f"{words}, at its bound" if parameter["at_bound"] and parameter["identifiable"] != "no" else words

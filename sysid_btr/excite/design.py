@@ -1,6 +1,6 @@
 """Experiment design: the motion after which the chosen parameters are known best.
 
-What a motion tells is its Fisher information under the sensors' noise floors, ``J' J`` of the whitened predicted
+What a motion is worth is its Fisher information under the sensors' noise floors, ``J' J`` of the whitened predicted
 sensors (Walter and Pronzato 1997, Identification of Parametric Models, chapter 6). A motion is scored by the mean
 of the standard errors that follow from it (A-optimal), each in a unit of its own, or by the volume of the
 confidence ellipsoid (D-optimal). Directions that a motion does not tell are bounded by the parameters' own bounds,
@@ -135,7 +135,8 @@ class Expected:
     parameters : (p,) what is asked.
     information : (p, p) Fisher information per unit of the parameters.
     estimates : one a parameter, as a fit of a log of this motion to the nominal model is expected to give them:
-        standard error (the Cramer-Rao bound), 95 % interval, whether it is told, and if not, with what it goes.
+        standard error (the Cramer-Rao bound), 95 % interval, whether it is identifiable, and if not, with what it is
+        confounded.
     """
 
     seconds: float
@@ -159,7 +160,7 @@ class Expected:
 
 
 def expect(problem: ReplayProblem) -> Expected:
-    """What a motion tells about the parameters of a problem, at its start values."""
+    """How informative a motion is about the parameters of a problem, at its start values."""
     at = problem.start
     _, jacobian = linearise(problem, at)
     jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)
@@ -344,7 +345,7 @@ class Design:
     Attributes
     ----------
     experiment, family, coefficients, log : the motion, and what it is for.
-    reference, designed : what the reference motion tells, and what this one does.
+    reference, designed : how informative the reference motion is, and this one.
     compared_with : what the reference motion is.
     result : what the estimator returned; its losses are of one repetition.
     beyond : joint -> rad or m by which the nominal model's position leaves the joint's range and nominal pose.
@@ -363,8 +364,8 @@ class Design:
     seconds: float
 
     @property
-    def told(self) -> list[bool]:
-        """(p,) which parameters either motion tells."""
+    def identifiable(self) -> list[bool]:
+        """(p,) which parameters are identifiable from either motion."""
         both = zip(self.reference.estimates, self.designed.estimates, strict=True)
         return [a.identifiable != "no" or b.identifiable != "no" for a, b in both]
 
@@ -376,8 +377,8 @@ class Design:
 
     @property
     def mean_ratio(self) -> float:
-        """Mean of `ratios` over the parameters that are told; 1 where none is."""
-        return float(np.mean(self.ratios[self.told])) if any(self.told) else 1.0
+        """Mean of `ratios` over the parameters that are identifiable; 1 where none is."""
+        return float(np.mean(self.ratios[self.identifiable])) if any(self.identifiable) else 1.0
 
 
 def design(
@@ -478,7 +479,7 @@ def configured(robot: Robot, reference: Log | None) -> Robot:
 
 
 def cheap(experiment: Experiment, log: Log) -> Experiment:
-    """The experiment with a coarser step, where that hardly changes what a motion tells."""
+    """The experiment with a coarser step, where that hardly changes how informative a motion is."""
     period = log.meta.sample_period or COARSE
     step = period / max(int(np.ceil(period / COARSE - 1e-9)), 1)
     coarse = replace(experiment, numerics=Numerics("RK4", step))

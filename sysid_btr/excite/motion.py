@@ -32,7 +32,7 @@ ACCELERATION = {False: 60.0, True: 3.0}
 TORQUE_SHARE = 0.5
 """Share of a servo's torque that its own inertia may take; the rest is for gravity, friction and other joints."""
 REACH = {False: 0.5, True: 0.05}
-"""rad or m, to either side, of a joint whose range neither model nor log tells."""
+"""rad or m, to either side, of a joint whose range neither model nor log states."""
 PERIOD = 10.0
 """s after which a motion repeats; it is as long as it shall be, the search is not."""
 RAMP = 1.0
@@ -309,8 +309,8 @@ def _room(
         free = margin * (high - low)
         return low + free, high - free
     if reference is not None and reference.has("command", joint):
-        told = reference.channels[f"command.{joint}"]
-        low, high = float(np.nanmin(told)), float(np.nanmax(told))
+        sent = reference.channels[f"command.{joint}"]
+        low, high = float(np.nanmin(sent)), float(np.nanmax(sent))
         if high > low:
             return low, high
     return home - REACH[slides], home + REACH[slides]

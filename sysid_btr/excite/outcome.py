@@ -65,8 +65,8 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
             "message": message(design),
             "termination": design.result.termination.value,
             "parameters": [
-                {**asdict(a), "reference": _told(b), "ratio": float(ratio) if told else None}
-                for a, b, ratio, told in zip(after, before, design.ratios, design.told, strict=True)
+                {**asdict(a), "reference": _uncertainty(b), "ratio": float(ratio) if known else None}
+                for a, b, ratio, known in zip(after, before, design.ratios, design.identifiable, strict=True)
             ],
             "effects": [],
             "mean_ratio": design.mean_ratio,
@@ -105,7 +105,7 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
     return plain
 
 
-def _told(estimate: Estimate) -> dict[str, Any]:
+def _uncertainty(estimate: Estimate) -> dict[str, Any]:
     entry = asdict(estimate)
     return {key: entry[key] for key in ("std", "ci95", "identifiable", "reason")}
 
@@ -117,7 +117,7 @@ def message(design: Design) -> str:
         f"{count} of {len(design.designed.estimates)} parameters are identifiable from this motion of "
         f"{design.family.clock.seconds:g} s",
     ]
-    if any(design.told):
+    if any(design.identifiable):
         parts.append(
             f"on average their intervals are {design.mean_ratio:.2f} of those after {design.compared_with} "
             f"({design.reference.seconds:.3g} s)"
@@ -134,7 +134,7 @@ def show(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     from rich.table import Table
     from rich.text import Text
 
-    from sysid_btr.display.text import number, told
+    from sysid_btr.display.text import identifiability, number
 
     yield Text(result["message"], style="bold")
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold")
@@ -153,12 +153,12 @@ def show(result: Mapping[str, Any]) -> Iterator[RenderableType]:
             number(0.5 * (p["ci95"][1] - p["ci95"][0]), 2) if known else "-",
             number(p["ratio"], 2),
             "x nominal" if p["unit"] == "1" else p["unit"],
-            told(p),
+            identifiability(p),
         )
     yield table
     for p in result["parameters"]:
         if p["reason"]:
-            yield Text(f"  {p['name']}: {told(p)}: {p['reason'].replace('this log', 'this motion')}")
+            yield Text(f"  {p['name']}: {identifiability(p)}: {p['reason'].replace('this log', 'this motion')}")
     floors = ", ".join(f"{channel} {value:.3g}" for channel, value in result["noise_floor"].items())
     yield Text(f"noise floor {result['noise_floor_source']}: {floors} (SI, median over joints)", style="dim")
     yield Text(

@@ -48,7 +48,7 @@ class Fit:
     numerics_shift : (p,) change of the estimates when the step is halved; on walks with the error of `Fused`.
     replays : candidates simulated.
     seconds : wall time.
-    optimum : (p,) the model's values, but for walks whose motion tells more than replays do: there, where residuals
+    optimum : (p,) the model's values; for walks whose motion is more informative than replays are, where residuals
         are least.
     profiles : likelihood along single parameters, where it was asked for (`identify.profile`).
     """
@@ -73,8 +73,8 @@ class Fit:
     @property
     def message(self) -> str:
         """The outcome in one sentence."""
-        told = sum(e.identifiable != "no" for e in self.estimates)
-        parts = [f"{told} of {len(self.estimates)} parameters are identifiable from this log"]
+        identifiable = sum(e.identifiable != "no" for e in self.estimates)
+        parts = [f"{identifiable} of {len(self.estimates)} parameters are identifiable from this log"]
         if "position" in self.before.holdout:
             nominal, before = self.nominal.holdout["position"], self.before.holdout["position"]
             unit = channel_units(self.study.robot)["position"].partition(",")[0]

@@ -1,4 +1,4 @@
-"""Honest standard errors: residuals are correlated, numerics are approximate, and some numbers cannot be told.
+"""Honest standard errors: residuals are correlated, numerics are approximate, and some parameters are not identifiable.
 
 The covariance is that of `objectives.covariance`, widened by what halving the step would change.
 """
@@ -28,7 +28,7 @@ class Estimate:
     ----------
     name, unit, nominal, bounds : of the parameter.
     value, std, ci95 : estimate, standard error and 95 % interval.
-    identifiable : whether this log tells it.
+    identifiable : whether it is, from this log.
     at_bound : whether the estimate lies on a bound.
     reason : why it is not identifiable, or what limits it; empty otherwise.
     """

@@ -44,7 +44,7 @@ def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = s
     fit : by least squares, or any other; the likelihood is that of its whitened residuals.
     name : of a free parameter.
     points : across the interval; more where a side is flat.
-    progress : told of every fit.
+    progress : called after every fit.
 
     Raises
     ------

@@ -96,7 +96,7 @@ def _make_targets(
         floor = tuple(noise_floor(measured[:, k]) for k in range(len(names)))
         mask = np.isfinite(measured) & (time >= min(warm_up, 0.1 * time[-1]))[:, None]
         if channel == "effort":
-            mask[-1] = False  # the replay ends here: what the servo is told at this sample is not replayed
+            mask[-1] = False  # the replay ends here: the command of this sample is not replayed
         live = mask.any(axis=0)
         targets.append(
             Target(

@@ -36,7 +36,7 @@ def plot_motion(design: Design) -> Figure:
     rows[-1].set_xlabel("time (s)")
     axis = right.subplots()
     place = np.arange(len(names))[::-1]
-    ratios = np.where(design.told, design.ratios, np.nan)
+    ratios = np.where(design.identifiable, design.ratios, np.nan)
     axis.barh(place, ratios, color=[FOUND if r <= 1 else PLAIN for r in np.nan_to_num(ratios)])
     for y, ratio in zip(place, ratios, strict=True):
         text = f" {ratio:.2f}" if np.isfinite(ratio) else " not identifiable from either"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.display.changes import model_lines
-from sysid_btr.display.text import compact, number, stages, told, walk_words
+from sysid_btr.display.text import compact, identifiability, number, stages, walk_words
 from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
@@ -112,7 +112,13 @@ def _template() -> Template:
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters.update(
-        si=si, number=number, told=told, compact=compact, digits=with_digits_of, typeset=_typeset, count=_count
+        si=si,
+        number=number,
+        identifiability=identifiability,
+        compact=compact,
+        digits=with_digits_of,
+        typeset=_typeset,
+        count=_count,
     )
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
 

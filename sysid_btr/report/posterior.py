@@ -26,7 +26,7 @@ ZOOM_SECONDS = 3.0
 
 
 def shown_parameters(posterior: Posterior) -> list[int]:
-    """Parameters that are drawn: those the log tells most about come first where there are too many."""
+    """Parameters that are drawn: those about which the log is most informative come first where there are too many."""
     count = len(posterior.estimates)
     if count <= MOST_PARAMETERS:
         return list(range(count))

@@ -1,7 +1,7 @@
 """How figures look: on a light page, on a dark one, or in whatever style a user has set.
 
 Functions that draw take the colours of text and frames from matplotlib's settings, so they follow a style that is in
-force (`page`, or one of the user's own); only what tells models apart has colours of its own.
+force (`page`, or one of the user's own); only what distinguishes models has colours of its own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 LIGHT = {"ink": "#1f2328", "faint": "#8b949e", "paper": "white"}
 DARK = {"ink": "#e6edf3", "faint": "#768390", "paper": "#0d1117"}
 MODEL_COLOURS = ("#d1495b", "#edae49", "#2e9e6b")
-"""Plain, parameters fitted, effects added; told apart also without red and green."""
+"""Plain, parameters fitted, effects added; distinguishable also without red and green."""
 PLAIN, FITTED, FOUND = MODEL_COLOURS
 SHADE = "#388bfd24"
 """Behind what is held out; lets both pages through."""

@@ -233,8 +233,8 @@ def describe(part: Part, place: str | None = None) -> str:
     for at in places:
         groups.setdefault(amounts(part, at), []).append(at)
     listed = [", ".join(names) if len(names) <= MOST_NAMES else f"{len(names)} places" for names in groups.values()]
-    told = [f"{names}: {words}" if words else names for names, words in zip(listed, groups, strict=True)]
-    return f"{called(part)} of {'; '.join(told)}"
+    groups_named = [f"{names}: {words}" if words else names for names, words in zip(listed, groups, strict=True)]
+    return f"{called(part)} of {'; '.join(groups_named)}"
 
 
 def called(part: Part) -> str:
