@@ -15,7 +15,7 @@ import toys
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
 from sysid_btr.diagnosis.hypotheses import Hypothesis
-from sysid_btr.diagnosis.scan import Question, Sensitivity, where_something_is
+from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, where_something_is
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.trials import attempt
 from sysid_btr.estimators import Journal
@@ -352,15 +352,15 @@ def test_a_digital_servo_is_no_missing_effect(planted: bool) -> None:
 
 
 def test_costly_questions_are_asked_only_where_a_simple_effect_explains_something() -> None:
-    def question(effect: type[Effect], *places: str) -> Question:
-        return Question(effect, places, ((1.0,),))
+    def at(effect: type[Effect], *places: str) -> Perturbation:
+        return Perturbation(effect, places, ((1.0,),))
 
     def sensitivity(place: str, gain: float) -> Sensitivity:
         nothing = np.zeros(0)
-        return Sensitivity(question(CoulombFriction, place), nothing.astype(np.int64), nothing, nothing, gain, nothing)
+        return Sensitivity(at(CoulombFriction, place), nothing.astype(np.int64), nothing, nothing, gain, nothing)
 
-    plain = [question(CoulombFriction, p) for p in ("hip", "knee", "ankle")]
-    costly = [question(Backlash, p) for p in ("hip", "knee", "ankle", "toe")] + [question(Backlash, "ankle", "hip")]
+    plain = [at(CoulombFriction, p) for p in ("hip", "knee", "ankle")]
+    costly = [at(Backlash, p) for p in ("hip", "knee", "ankle", "toe")] + [at(Backlash, "ankle", "hip")]
     found = [sensitivity("knee", 500.0), sensitivity("hip", 6.0), sensitivity("ankle", 4.0)]
     asked = where_something_is(plain, found, costly, Selection())
     assert [q.places for q in asked] == [("hip",), ("knee",), ("toe",), ("ankle", "hip")], "nothing is known of the toe"

@@ -12,7 +12,7 @@ import pytest
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
-from sysid_btr.diagnosis.scan import Question, Sensitivity
+from sysid_btr.diagnosis.scan import Perturbation, Sensitivity
 from sysid_btr.diagnosis.selection import (
     Selection,
     agree,
@@ -535,8 +535,8 @@ def sensitivity(
     values = np.zeros(len(effect.kinds))
     values[effect.main] = amount
     response = np.array(direction, dtype=np.float64)[:, None]
-    question = Question(effect, places, ((amount,),))
-    return Sensitivity(question, np.arange(len(response)), response, np.ones(1), gain, values)
+    perturbation = Perturbation(effect, places, ((amount,),))
+    return Sensitivity(perturbation, np.arange(len(response)), response, np.ones(1), gain, values)
 
 
 HIP, KNEE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
-from sysid_btr.diagnosis.scan import Question
+from sysid_btr.diagnosis.scan import Perturbation
 from sysid_btr.diagnosis.signature import proposals, signature
 from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
 from sysid_btr.identify.refit import refit
@@ -78,7 +78,7 @@ def torques_of(log: Log) -> dict[str, MissingTorque]:
     return {t.joint: t for t in missing_torques(study.train_problem(()), NOTHING, study.scales)}
 
 
-def asked(log: Log, library: Sequence[type[Effect]] = EFFECTS) -> list[Question]:
+def asked(log: Log, library: Sequence[type[Effect]] = EFFECTS) -> list[Perturbation]:
     study = study_of(log)
     problem = study.train_problem(())
     return proposals(study, problem, NOTHING, problem.residuals(np.zeros((1, 0)))[0], library)

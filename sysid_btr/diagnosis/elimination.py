@@ -47,7 +47,7 @@ def eliminate(state: State, rules: Selection, progress: Progress) -> State:
     return state
 
 
-def thinned(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:
+def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:
     """A trial without those locations of its group whose small amounts data do not miss; and what that took."""
     spent, effect = 0, trial.hypothesis.effect
     neutral = trial.hypothesis.term(study.scales).neutral[effect.main]
@@ -86,20 +86,20 @@ def _prune(state: State, rules: Selection) -> tuple[State, list[str]]:
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
             state = replace(state, fitted=trial, rivals=state.without_rivals_of(effect))
     for effect in state.effects if len(state.effects) > 1 else ():
-        state, dropped = _thinned_again(state, effect, rules)
+        state, dropped = _at_fewer_locations(state, effect, rules)
         if dropped:
             removed.append(f"{effect.name} at {', '.join(dropped)}")
     return state, removed
 
 
-def _thinned_again(state: State, effect: Effect, rules: Selection) -> tuple[State, tuple[str, ...]]:
+def _at_fewer_locations(state: State, effect: Effect, rules: Selection) -> tuple[State, tuple[str, ...]]:
     """The state with an effect at fewer locations, and those that are dropped."""
     if effect.shared:
         return state, ()
     amounts = state.fitted.model.own(effect)
     whole = Hypothesis(type(effect), effect.places, False, amounts, 0.0)
     now = replace(state.fitted, model=state.fitted.model.without(effect).with_(effect, amounts))
-    left, spent = thinned(state.study, Trial(whole, now), rules)
+    left, spent = without_dispensable(state.study, Trial(whole, now), rules)
     state = state.spent(spent)
     dropped = tuple(p for p in effect.places if p not in left.hypothesis.places)
     if not dropped:

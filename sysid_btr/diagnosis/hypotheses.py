@@ -66,26 +66,26 @@ def form_hypotheses(found: Sequence[Sensitivity], residuals: int, rules: Selecti
     rules : what a hypothesis needs, and how many to return.
     """
     best_at: dict[str, float] = {}
-    single = [s for s in found if len(s.question.places) == 1]
+    single = [s for s in found if len(s.perturbation.places) == 1]
     for one in single:
-        place = one.question.place
+        place = one.perturbation.place
         best_at[place] = max(best_at.get(place, 0.0), one.gain)
     result: list[Hypothesis] = []
     for one in found:
-        if len(one.question.places) > 1 and one.gain >= rules.candidate_gain:
-            question = one.question
-            result.append(Hypothesis(question.effect, question.places, True, one.values, one.gain))
-    for effect in dict.fromkeys(s.question.effect for s in single):
-        own = _best_probe_per_place([s for s in single if s.question.effect is effect])
+        if len(one.perturbation.places) > 1 and one.gain >= rules.candidate_gain:
+            perturbation = one.perturbation
+            result.append(Hypothesis(perturbation.effect, perturbation.places, True, one.values, one.gain))
+    for effect in dict.fromkeys(s.perturbation.effect for s in single):
+        own = _best_probe_per_place([s for s in single if s.perturbation.effect is effect])
         if own[0].gain < rules.candidate_gain:
             continue
         lead = own[0]
-        result.append(Hypothesis(effect, (lead.question.place,), False, lead.values, lead.gain))
-        candidates = [s for s in own if s.gain >= rules.location_rival * best_at[s.question.place]]
+        result.append(Hypothesis(effect, (lead.perturbation.place,), False, lead.values, lead.gain))
+        candidates = [s for s in own if s.gain >= rules.location_rival * best_at[s.perturbation.place]]
         group, gain = _grow(lead, candidates, residuals, rules)
         group = group[: max(rules.most_parameters // len(effect.kinds), 1)]
         if len(group) > 1:
-            places = tuple(s.question.place for s in group)
+            places = tuple(s.perturbation.place for s in group)
             values = np.array([s.values for s in group])
             result.append(Hypothesis(effect, places, False, values.ravel(), gain))
             if agree(values[:, effect.main], rules.common_spread):
@@ -133,7 +133,7 @@ def from_arrays(
 def _best_probe_per_place(found: Sequence[Sensitivity]) -> list[Sensitivity]:
     best: dict[str, Sensitivity] = {}
     for one in found:
-        place = one.question.place
+        place = one.perturbation.place
         if place not in best or one.gain > best[place].gain:
             best[place] = one
     return sorted(best.values(), key=lambda s: -s.gain)

@@ -22,13 +22,13 @@ from sysid_btr.terms.scales import Scales
 FAINT = 1e-4
 """Squared response of a direction, relative to an effect's strongest one, below which it is not moved."""
 BLOCK = 256
-"""Questions whose responses are held at once."""
+"""Perturbations whose responses are held at once."""
 NO_RESPONSE = 1e-6
 """Response, relative to the residual, below which a log cannot show an effect."""
 
 
 @dataclass(frozen=True)
-class Question:
+class Perturbation:
     """One effect at one place, or alike at several, at one working point."""
 
     effect: type[Effect]
@@ -43,11 +43,11 @@ class Question:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What the residual does, by what was asked.
+    """How the residual responds to a perturbation.
 
     Attributes
     ----------
-    question : what was asked.
+    perturbation : what was simulated.
     rows : (n,) residuals that can respond.
     response : (n, directions) change of the whitened residual, projected off the declared parameters.
     amounts : (directions,) legal multiples that explain most of the residual.
@@ -55,7 +55,7 @@ class Sensitivity:
     values : (kinds,) the effect they stand for.
     """
 
-    question: Question
+    perturbation: Perturbation
     rows: IntArray
     response: FloatArray
     amounts: FloatArray
@@ -63,18 +63,18 @@ class Sensitivity:
     values: FloatArray
 
 
-def questions(
+def perturbations(
     effects: Sequence[type[Effect]], places: dict[str, tuple[str, ...]], scales: Scales
-) -> list[Question]:
+) -> list[Perturbation]:
     """All effects at all places of their scope, and alike at all places at once, at all working points."""
     asked = [
-        Question(effect, (place,), probe)
+        Perturbation(effect, (place,), probe)
         for effect in effects
         for place in places[effect.scope]
         for probe in effect.probes(scale_at(scales, place))
     ]
     asked += [
-        Question(effect, places[effect.scope], probe)
+        Perturbation(effect, places[effect.scope], probe)
         for effect in effects
         if effect.everywhere and len(places[effect.scope]) > 1
         for probe in effect.probes(middle_scale([scales[p] for p in places[effect.scope]]))
@@ -87,11 +87,11 @@ def scan(
     values: FloatArray,
     residual: FloatArray,
     jacobian: FloatArray,
-    asked: Sequence[Question],
+    asked: Sequence[Perturbation],
     scales: Scales,
     rules: Selection,
 ) -> list[Sensitivity]:
-    """Simulate every question about the residual that a fit has left.
+    """Simulate every perturbation, and what it explains of the residual that a fit has left.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def scan(
     residual, jacobian : (r,) and (r, p) there, whitened.
     asked : effects, places, working points.
     scales : sizes at the joints.
-    rules : where costly questions are asked.
+    rules : where costly perturbations are tried.
 
     Returns
     -------
@@ -110,33 +110,33 @@ def scan(
     basis = _orthonormal(jacobian)
     rest = residual - basis @ (basis.T @ residual)
     plain = [q for q in asked if not _costly(q)]
-    found = _ask(problem, values, rest, basis, plain, scales) if plain else []
+    found = _simulate(problem, values, rest, basis, plain, scales) if plain else []
     costly = where_something_is(plain, found, [q for q in asked if _costly(q)], rules)
     laws = [q for q in costly if not q.effect.structural]
     if laws:
-        found += _ask(problem, values, rest, basis, laws, scales)
+        found += _simulate(problem, values, rest, basis, laws, scales)
     for batch in _by_structure([q for q in costly if q.effect.structural], problem):
-        found += _ask(problem, values, rest, basis, batch, scales)
+        found += _simulate(problem, values, rest, basis, batch, scales)
     return sorted(found, key=lambda t: -t.gain)
 
 
-def _costly(question: Question) -> bool:
+def _costly(perturbation: Perturbation) -> bool:
     """Whether the effect acts step by step, or needs another model."""
-    return question.effect.structural or question.effect.overrides("law")
+    return perturbation.effect.structural or perturbation.effect.overrides("law")
 
 
 def where_something_is(
-    plain: Sequence[Question], found: Sequence[Sensitivity], costly: Sequence[Question], rules: Selection
-) -> list[Question]:
-    """Questions about places at which some simpler effect explains something, of what the best explains anywhere.
+    plain: Sequence[Perturbation], found: Sequence[Sensitivity], costly: Sequence[Perturbation], rules: Selection
+) -> list[Perturbation]:
+    """Perturbations at places at which some simpler effect explains something, of what the best explains anywhere.
 
     What an effect does at a joint follows its command, position, velocity, acceleration or load, and so does what one
     of the simpler ones does there. A place that is passed over is asked about again once others are explained.
     """
     best = dict.fromkeys((q.place for q in plain if len(q.places) == 1), 0.0)
     for one in found:
-        if len(one.question.places) == 1:
-            best[one.question.place] = max(best[one.question.place], one.gain)
+        if len(one.perturbation.places) == 1:
+            best[one.perturbation.place] = max(best[one.perturbation.place], one.gain)
     least = rules.costly_share * max(best.values(), default=0.0)
     return [q for q in costly if len(q.places) > 1 or best.get(q.place, least) >= least]
 
@@ -151,15 +151,15 @@ def _orthonormal(jacobian: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > 1e-6 * s[0]])
 
 
-def _subtree(question: Question, where: dict[str, int]) -> int:
-    found = {where.get(place, WHOLE_ROBOT) for place in question.places}
+def _subtree(perturbation: Perturbation, where: dict[str, int]) -> int:
+    found = {where.get(place, WHOLE_ROBOT) for place in perturbation.places}
     return found.pop() if len(found) == 1 else WHOLE_ROBOT
 
 
-def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Question]]:
-    """Structural questions that can share one compiled model: one place a subtree."""
+def _by_structure(asked: list[Perturbation], problem: ReplayProblem) -> list[list[Perturbation]]:
+    """Structural perturbations that can share one compiled model: one place a subtree."""
     where = problem.where
-    result: list[list[Question]] = []
+    result: list[list[Perturbation]] = []
     for effect in dict.fromkeys(q.effect for q in asked):
         own = [q for q in asked if q.effect is effect and len(q.places) == 1]
         result += [[q] for q in asked if q.effect is effect and len(q.places) > 1]
@@ -177,15 +177,15 @@ def _by_structure(asked: list[Question], problem: ReplayProblem) -> list[list[Qu
     return result
 
 
-def _ask(
+def _simulate(
     problem: ReplayProblem,
     values: FloatArray,
     rest: FloatArray,
     basis: FloatArray,
-    asked: list[Question],
+    asked: list[Perturbation],
     scales: Scales,
 ) -> list[Sensitivity]:
-    """Simulate questions that share a set of terms."""
+    """Simulate perturbations that share a set of terms."""
     where = problem.where
     model, columns = Model(problem.terms, values), {}
     for effect in dict.fromkeys(q.effect for q in asked):
@@ -196,11 +196,11 @@ def _ask(
             columns[effect, place] = slice(first + i * len(effect.kinds), first + (i + 1) * len(effect.kinds))
         model = model.with_(term, term.neutral)
     wide, neutral = problem.with_model(model), model.values
-    # one simulation carries one direction of one question in each subtree
+    # one simulation carries one direction of one perturbation in each subtree
     groups: dict[int, list[tuple[int, int]]] = {}
-    for i, question in enumerate(asked):
-        for d in range(len(question.probe)):
-            groups.setdefault(_subtree(question, where), []).append((i, d))
+    for i, perturbation in enumerate(asked):
+        for d in range(len(perturbation.probe)):
+            groups.setdefault(_subtree(perturbation, where), []).append((i, d))
     alone = groups.pop(WHOLE_ROBOT, [])
     depth = max((len(group) for group in groups.values()), default=0)
     jobs = [[group[k] for group in groups.values() if k < len(group)] for k in range(depth)]
@@ -208,9 +208,9 @@ def _ask(
     candidates = np.tile(neutral, (1 + len(jobs), 1))
     for row, job in enumerate(jobs, start=1):
         for i, d in job:
-            question = asked[i]
-            for place in question.places:
-                candidates[row, columns[question.effect, place]] = question.probe[d]
+            perturbation = asked[i]
+            for place in perturbation.places:
+                candidates[row, columns[perturbation.effect, place]] = perturbation.probe[d]
     subtree_of_row = wide._subtrees[1]
     responses: dict[tuple[int, int], FloatArray | None] = {}
     rows_of = {subtree: np.flatnonzero(subtree_of_row == subtree) for subtree in groups}
@@ -229,13 +229,13 @@ def _ask(
     parts = {subtree: _Part(rows, basis[rows], rest[rows]) for subtree, rows in rows_of.items()}
     whole = _Part(everywhere, basis, rest)
     found = []
-    for i, question in enumerate(asked):
-        seen = [responses[i, d] for d in range(len(question.probe))]
+    for i, perturbation in enumerate(asked):
+        seen = [responses[i, d] for d in range(len(perturbation.probe))]
         known = [c for c in seen if c is not None]
         if len(known) < len(seen):
             continue
-        part = parts.get(_subtree(question, where), whole)
-        answer = _judge(question, part, np.column_stack(known), least, scales)
+        part = parts.get(_subtree(perturbation, where), whole)
+        answer = _judge(perturbation, part, np.column_stack(known), least, scales)
         if answer is not None:
             found.append(answer)
     return found
@@ -251,7 +251,7 @@ class _Part:
 
 
 def _judge(
-    question: Question, part: _Part, response: FloatArray, least: float, scales: Scales
+    perturbation: Perturbation, part: _Part, response: FloatArray, least: float, scales: Scales
 ) -> Sensitivity | None:
     """How much of the residual legal multiples of a response explain; None of one below `least`, squared."""
     coefficients = part.basis.T @ response
@@ -262,12 +262,12 @@ def _judge(
     if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= least:
         return None
     # the residual is measured minus predicted, so a response that explains it has the opposite sign
-    amounts = _legal(question.effect, gram, -inner)
+    amounts = _legal(perturbation.effect, gram, -inner)
     gain = float(-2 * amounts @ inner - amounts @ gram @ amounts)
-    values = question.effect.combine(scale_at(scales, question.place), question.probe, amounts)
+    values = perturbation.effect.combine(scale_at(scales, perturbation.place), perturbation.probe, amounts)
     if values is None or gain <= 0:
         return None
-    return Sensitivity(question, part.rows, projected, amounts, gain, values)
+    return Sensitivity(perturbation, part.rows, projected, amounts, gain, values)
 
 
 def _legal(effect: type[Effect], gram: FloatArray, target: FloatArray) -> FloatArray:

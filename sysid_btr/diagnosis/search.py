@@ -9,9 +9,9 @@ from time import perf_counter
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.elimination import thinned
+from sysid_btr.diagnosis.elimination import without_dispensable
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
-from sysid_btr.diagnosis.scan import Question, Sensitivity, questions, scan
+from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, perturbations, scan
 from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain
 from sysid_btr.diagnosis.signature import proposals
 from sysid_btr.diagnosis.state import State
@@ -92,7 +92,7 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
     study = state.study
     if winner.fitted.numerics != study.numerics:
         study = replace(study, numerics=winner.fitted.numerics)
-    kept, spent = thinned(study, winner, rules)
+    kept, spent = without_dispensable(study, winner, rules)
     hypothesis, fitted = kept.hypothesis, kept.fitted
     rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
     # a more general effect takes the place of the special case it includes
@@ -112,7 +112,7 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
 
 
 def _promising(state: State, library: Library, rules: Selection) -> tuple[list[Hypothesis], int]:
-    """The leading hypotheses of a scan, and how many questions were answered; an interrupted run noted them."""
+    """The leading hypotheses of a scan, and how many perturbations were simulated; an interrupted run noted them."""
     study, values = state.study, state.fitted.model.values[None]
     places = (*joint_names(study.robot), *body_names(study.robot), "robot")
     known = None if study.journal is None else study.journal.replay("scan", values, whole=True)
@@ -133,12 +133,12 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     study, model = state.study, state.fitted.model
     problem = shorten(study, rules.scan_seconds).train_problem(model)
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
-    asked = _questions(state, library, problem, residual, rules)
+    asked = _perturbations(state, library, problem, residual, rules)
     if study.procedure.costly and len(asked) > rules.glance_most:
         glance = shorten(study, rules.glance_seconds).train_problem(model)
         linear = linearise(glance, model.values, step=study.stencil(model.terms))
         seen = scan(glance, model.values, *linear, asked, study.scales, rules)
-        asked = [s.question for s in seen[: rules.glance_most]]
+        asked = [s.perturbation for s in seen[: rules.glance_most]]
     # what is left is the right integrator's; what an effect would change may be a little off
     cheap = problem.with_numerics(study.cheap)
     found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
@@ -146,14 +146,14 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
         # one hypothesis an effect, begun at its best working point: initial guesses hold other amounts
         best: dict[type[Effect], Sensitivity] = {}
         for one in found:
-            best.setdefault(one.question.effect, one)
+            best.setdefault(one.perturbation.effect, one)
         found = list(best.values())
     return found, len(residual)
 
 
-def _questions(
+def _perturbations(
     state: State, library: Library, problem: ReplayProblem, residual: FloatArray, rules: Selection
-) -> list[Question]:
+) -> list[Perturbation]:
     """What a scan asks for: an effect already at a location is not, as it is refitted with everything else."""
     study = state.study
     places = {
@@ -162,7 +162,7 @@ def _questions(
         "body": body_names(study.robot),
         "robot": ("robot",),
     }
-    asked: list[Question] = questions(library, places, study.scales)
+    asked: list[Perturbation] = perturbations(library, places, study.scales)
     if rules.alike:
         asked = [q for q in asked if len(q.places) > 1 or q.effect.scope == "robot"]
     else:

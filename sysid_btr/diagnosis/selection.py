@@ -36,10 +36,10 @@ class Selection:
     scan_seconds: float = 15.0
     """Part of each log that is scanned; the leading hypotheses are refitted on more. Time."""
     glance_seconds: float = 2.5
-    """Part of each log of a floating base on which all questions are asked, each a simulation of its own there.
+    """Part of each log of a floating base on which all perturbations are simulated, each a simulation of its own there.
     Time."""
     glance_most: int = 150
-    """Questions that are then asked on the part that is scanned. Time."""
+    """Perturbations that are then simulated on the part that is scanned. Time."""
     refit_seconds: float = 20.0
     """Part of each log to which hypotheses are fitted. Time."""
     start_seconds: float = 6.0
@@ -62,7 +62,7 @@ class Selection:
 
     candidate_gain: float = 40.0
     """Decrease of the sum of squared whitened residuals below which a location is noise. By chance it exceeds 40 in
-    one of 4e9 questions with one amount, and residuals that are correlated in time make that far more likely."""
+    one of 4e9 perturbations with one amount, and residuals that are correlated in time make that far more likely."""
     costly_share: float = 0.01
     """Of the best location's gain: below it nothing costly is asked about a location, which is asked about again once
     others are explained. Time."""
@@ -147,7 +147,7 @@ class Selection:
     # --- what is kept ---
 
     largest_group: int = 10
-    """Groups up to so many locations are thinned, each by a refit. Time."""
+    """Groups up to so many locations are reduced, each by a refit. Time."""
     doubtful: float = 0.5
     """An amount below this fraction of the group's largest is doubted. Judgement."""
     common_amount: float = 0.05

@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
-from sysid_btr.diagnosis.scan import Question
+from sysid_btr.diagnosis.scan import Perturbation
 from sysid_btr.diagnosis.signal_features import Line, Train, hats, predicted_share, without
 from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
 from sysid_btr.identify.study import Study
@@ -66,8 +66,8 @@ def proposals(
     values: FloatArray,
     residual: FloatArray,
     library: Sequence[type[Effect]],
-) -> list[Question]:
-    """Questions about effects whose place in time or angle only the residual can tell.
+) -> list[Perturbation]:
+    """Perturbations at effects whose place in time or angle only the residual shows.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def proposals(
     wanted = {Cogging, ExternalDisturbance, ExternalDisturbanceTrain, DriveDisturbanceTrain} & set(library)
     if not wanted or not _loud(problem, residual):
         return []
-    asked: list[Question] = []
+    asked: list[Perturbation] = []
     torques = missing_torques(problem, values, study.scales)
     worst = max((_blame(t) for t in torques), default=0.0)
     for one in torques:
@@ -87,22 +87,22 @@ def proposals(
             continue
         scale, place = study.scales[one.joint], (one.joint,)
         if Cogging in wanted:
-            asked += [Question(Cogging, place, Cogging.probe_at(scale, x.number)) for x in spatial_lines(one)]
+            asked += [Perturbation(Cogging, place, Cogging.probe_at(scale, x.number)) for x in spatial_lines(one)]
         push = single_pulse(one) if ExternalDisturbance in wanted else None
         # pulses of a train that differ are no pushes that come again: what they follow is something else
         if push is not None and not _within_train(problem, values, one.joint, *push):
-            asked.append(Question(ExternalDisturbance, place, ExternalDisturbance.probe_at(scale, *push)))
+            asked.append(Perturbation(ExternalDisturbance, place, ExternalDisturbance.probe_at(scale, *push)))
         train = pulse_train(one)
         if train is None:
             continue
         when = (train.start, train.duration, train.period)
         if ExternalDisturbanceTrain in wanted:
             probe = ExternalDisturbanceTrain.probe_at(scale, *when)
-            asked.append(Question(ExternalDisturbanceTrain, place, probe))
+            asked.append(Perturbation(ExternalDisturbanceTrain, place, probe))
         # without a measured effort both trains leave the same trace
         if DriveDisturbanceTrain in wanted and any(t.channel == "effort" for t in problem.episodes[0].targets):
             probe = DriveDisturbanceTrain.probe_at(scale, *when)
-            asked.append(Question(DriveDisturbanceTrain, place, probe))
+            asked.append(Perturbation(DriveDisturbanceTrain, place, probe))
     return asked
 
 
