@@ -131,17 +131,13 @@ def test_the_ant_has_six_legs_eighteen_servos_and_stands() -> None:
 
 
 def test_a_length_written_into_fields_is_the_model_that_a_compiler_makes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mujoco.batch import Batch
-
     term = SegmentLength(places=("LFFemur", "RMTibia"))
     spec = MODEL.make_spec()
     term.edit_spec(spec)
     model = spec.compile()
-    batch = Batch(model, 1, 1)
-    models = BatchModel(model, batch, make_index(model), 0.005)
+    models = BatchModel(model, make_index(model), 0.005, 1)
     models.write(term.model_fields(models, np.array([[[1.3], [0.8]]])))
-    batch.set_const()
-    written = batch.get_model(0)
+    written = models.candidate(0)
     femur, tibia, add_leg = ant_module.FEMUR, ant_module.TIBIA, ant_module._add_leg
     trunk = MODEL.compile().body_pos[1]
 

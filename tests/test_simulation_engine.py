@@ -30,6 +30,7 @@ from toys import (
 from sysid_btr.errors import ModelError
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
+from sysid_btr.simulation import mujoco_batch
 from sysid_btr.simulation import replay as replay_module
 from sysid_btr.simulation.batching import batched_chunks, group_replays
 from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps, step_inputs
@@ -189,7 +190,7 @@ def test_chunks_and_threads_give_the_same_bits(law: bool, monkeypatch: pytest.Mo
     for chunk, threads in ((32, 2), (7, 1), (70, 0)):
         monkeypatch.setattr(replay_module, "CHUNK", chunk)
         monkeypatch.setattr(replay_module, "CHUNK_DOFS", 0)
-        monkeypatch.setattr(replay_module, "SEGMENT", 11 * chunk)
+        monkeypatch.setattr(mujoco_batch, "SEGMENT", 11 * chunk)
         seen = run(leg(), LEG_LOG, terms, rows, threads=threads, effort=True)
         np.testing.assert_array_equal(seen.position, wanted.position)
         np.testing.assert_array_equal(seen.velocity, wanted.velocity)

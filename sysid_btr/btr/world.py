@@ -16,15 +16,14 @@ from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.simulation.compiling import make_index
+from sysid_btr.simulation.mujoco_batch import POSITION, evaluate
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import CHUNK, Replay
-from sysid_btr.simulation.setup import set_out, write_model
 from sysid_btr.simulation.silence import silenced
-from sysid_btr.terms.base import BatchModel, JointAddresses, Outputs, Term
+from sysid_btr.terms.base import BatchModel, Fields, JointAddresses, Outputs, Term
 
 if TYPE_CHECKING:
     import mujoco
-    from mujoco.batch import Batch
 
 STEP = 0.005
 """s, longest step: MuJoCo's contacts have time constants of 20 ms."""
@@ -78,23 +77,14 @@ class World(Replay):
             yield rows, outputs
 
     def _walk(self, commands: FloatArray, values: FloatArray) -> Outputs:
-        from mujoco.batch import Batch
-
         m, grid, index = len(commands), self.grid, self.index
         pairs = self._values(values)
-        batch = Batch(self.model, m, self.threads)
-        rig = self._rig(batch, pairs)
         held = np.repeat(commands[:, :-1], grid.steps // (commands.shape[1] - 1), axis=1)
         qpos, qvel = commands[:, 0].copy(), np.zeros((m, len(index.joints)))
-        held, applied = set_out(rig, pairs, qpos, qvel, held, grid.steps)
+        setup = self._prepare(self.batch(pairs, m), pairs, qpos, qvel, held, ((self.log, grid),))
         assert index.base is not None
-        batch.bind("qpos")[:, index.base[0] + 2] -= lowest(self.model, batch)
-        return self._go(rig, pairs, held, applied, grid)
-
-    def _rig(self, batch: Batch, pairs: list[tuple[Term, FloatArray]]) -> BatchModel:
-        rig = BatchModel(self.model, batch, self.index, self.numerics.timestep)
-        write_model(rig, pairs)
-        return rig
+        setup.state["qpos"][:, index.base[0] + 2] -= lowest(setup.batch, setup.state, self.threads)
+        return self._go(setup, pairs, grid)
 
     def sensors(self, outputs: Outputs, command: FloatArray, values: FloatArray) -> dict[str, FloatArray]:
         """The model's own sensors by name, (n, size) each, along the first of some motions.
@@ -105,39 +95,31 @@ class World(Replay):
         command : (n, j) of that motion.
         values : (p,) its candidate.
         """
-        from mujoco.batch import Batch
-
-        n, index = len(command), self.index
+        n, index, model = len(command), self.index, self.model
         assert index.base is not None
         assert outputs.base is not None
-        batch = Batch(self.model, n, self.threads)
-        self._rig(batch, self._values(np.tile(values, (n, 1))))
-        qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+        qpos, qvel, ctrl = np.tile(model.qpos0, (n, 1)), np.zeros((n, model.nv)), np.zeros((n, model.nu))
         place, motion = index.base
         qpos[:, place : place + 7], qvel[:, motion : motion + 6] = outputs.base[0, :, :7], outputs.base[0, :, 7:]
         qpos[:, index.qpos], qvel[:, index.dof] = outputs.position[0], outputs.velocity[0]
         driven = index.actuator >= 0
-        batch.bind("ctrl")[:, index.actuator[driven]] = command[:, driven]
-        data = batch.bind("sensordata")
-        batch.forward()
-        first = self.model.sensor_adr
+        ctrl[:, index.actuator[driven]] = command[:, driven]
+        batch = self.batch(self._values(np.tile(values, (n, 1))), n)
+        state = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl}
+        data = evaluate(batch, state, ("sensordata",), threads=self.threads)["sensordata"]
+        first = model.sensor_adr
         return {
-            self.model.sensor(s).name: data[:, first[s] : first[s] + self.model.sensor_dim[s]].copy()
-            for s in range(self.model.nsensor)
+            model.sensor(s).name: data[:, first[s] : first[s] + model.sensor_dim[s]] for s in range(model.nsensor)
         }
 
 
-def lowest(model: mujoco.MjModel, batch: Batch) -> FloatArray:
-    """Height (m,) of the lowest point of what can touch the ground, in each simulation's present pose."""
-    place, turn = batch.bind("geom_xpos"), batch.bind("geom_xmat")
-    batch.forward(stage=1)
-    sizes = batch.expanded("geom_size")
-    sizes = np.broadcast_to(model.geom_size, (batch.nsim, *model.geom_size.shape)) if sizes is None else sizes
-    heights = [
-        place[:, g, 2] - _reach(int(model.geom_type[g]), sizes[:, g], turn.reshape(batch.nsim, -1, 9)[:, g, 6:])
-        for g in feet_geoms(model)
-    ]
-    return np.min(heights, axis=0) if heights else np.zeros(batch.nsim)
+def lowest(batch: BatchModel, state: Fields, threads: int = 0) -> FloatArray:
+    """Height (m,) of the lowest point of what can touch the ground, in each candidate's pose."""
+    found = evaluate(batch, state, ("geom_xpos", "geom_xmat"), stage=POSITION, threads=threads)
+    place, up = found["geom_xpos"], found["geom_xmat"].reshape(batch.size, -1, 9)[:, :, 6:]
+    kinds, sizes = batch.model.geom_type, batch.read("geom_size")
+    heights = [place[:, g, 2] - _reach(int(kinds[g]), sizes[:, g], up[:, g]) for g in feet_geoms(batch.model)]
+    return np.min(heights, axis=0) if heights else np.zeros(batch.size)
 
 
 def feet_geoms(model: mujoco.MjModel) -> IntArray:

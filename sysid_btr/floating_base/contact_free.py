@@ -9,7 +9,6 @@ doi:10.1016/j.automatica.2006.08.002; as one sparse least-squares problem over t
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -30,14 +29,12 @@ from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid, make_grid
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
-from sysid_btr.simulation.setup import write_model
 from sysid_btr.simulation.silence import silenced
 
 if TYPE_CHECKING:
     import mujoco
-    from mujoco.batch import Batch
 
-    from sysid_btr.terms.base import BatchModel, JointAddresses
+    from sysid_btr.terms.base import BatchModel, Fields, JointAddresses
 
 ROUNDS = 6
 """Gauss-Newton steps at most; the first moves states alone."""
@@ -110,12 +107,14 @@ class SampleSteps(FloatingReplay):
         """Bodies that touch the ground."""
         return [self.model.body(foot.name).id for foot in touching_bodies(self.model)]
 
-    def push(self, batch: Batch, window: IntArray, change: FloatArray | None) -> None:
+    def push(self, window: IntArray, change: FloatArray | None) -> Fields:
         assert self.wrench is not None
         wrench = self.wrench[window]
         if change is not None:
             wrench = wrench + change[:, -wrench[0].size :].reshape(wrench.shape)
-        batch.bind("xfrc_applied")[:, self.feet] = wrench
+        pushed = np.zeros((len(window), self.model.nbody, 6))
+        pushed[:, self.feet] = wrench
+        return {"xfrc_applied": pushed}
 
     def ends(self, candidates: FloatArray, row: IntArray, window: IntArray, change: FloatArray) -> Windows:
         """States at the ends of steps: of candidate `row`, in step `window`, from a start with a `change`."""
@@ -275,7 +274,7 @@ def _suits(replay: FloatingReplay) -> bool:
         and replay.numerics.servo_period is None
         and replay.numerics.integrator != "Euler"
         and not any(m.structural or any(m.overrides(hook) for hook in BEYOND) for m in kinds)
-        and not any(name.startswith("opt.") for name in _written(replay, _nominal(replay)).touched)
+        and not any(name.startswith("opt.") for name in _written(replay, _nominal(replay)).fields)
     )
 
 
@@ -288,14 +287,8 @@ def _nominal(replay: WindowReplay) -> FloatArray:
 
 
 def _written(replay: WindowReplay, values: FloatArray) -> BatchModel:
-    """A rig with a candidate's numbers in its fields."""
-    from mujoco.batch import Batch
-
-    from sysid_btr.terms.base import BatchModel
-
-    rig = BatchModel(replay.model, Batch(replay.model, 1, 1), replay.index, replay.grid.timestep)
-    write_model(rig, replay._values(values[None]))
-    return rig
+    """The models of one candidate."""
+    return replay.batch(replay._values(values[None]), 1)
 
 
 def _chain(replay: FloatingReplay) -> _Chain:
@@ -413,14 +406,7 @@ def _blows(chain: _Chain, values: FloatArray) -> FloatArray:
 
 def candidate_model(replay: WindowReplay, values: FloatArray) -> mujoco.MjModel:
     """The compiled model with a candidate's numbers in it."""
-    import mujoco
-
-    model, rig = copy.copy(replay.model), _written(replay, values)
-    for name in rig.touched:
-        field = getattr(model, name)
-        field[...] = np.asarray(rig.array(name))[0].reshape(field.shape)
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model
+    return _written(replay, values).candidate(0)
 
 
 def difference(a: Windows, b: Windows) -> FloatArray:

@@ -20,7 +20,8 @@ from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.base import Term
+from sysid_btr.simulation.servo import ServoLaw
+from sysid_btr.terms.base import BatchModel, Term
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Model, Terms, as_model
 from sysid_btr.terms.scales import JointScale, Scales
@@ -246,15 +247,13 @@ def _torque_asked(robot: Robot, log: Log) -> dict[str, FloatArray]:
     """Torque (n,) of each joint's servo for the commands and positions as logged."""
     model = robot.compile()
     index = make_index(model)
-    result = {}
-    for joint, a in zip(index.joints, index.actuator, strict=True):
-        if a < 0 or not (log.has("position", joint) and log.has("command", joint)):
-            continue
-        command, position = log.channels[f"command.{joint}"], log.channels[f"position.{joint}"]
-        gear = float(model.actuator_gear[a, 0])
-        bias = model.actuator_biasprm[a]
-        force = model.actuator_gainprm[a, 0] * command + bias[0] + bias[1] * gear * position
-        if model.actuator_forcelimited[a]:
-            force = np.clip(force, *model.actuator_forcerange[a])
-        result[joint] = (gear * force)[np.isfinite(force)]
-    return result
+    driven = [j for j, a in zip(index.joints, index.actuator, strict=True) if a >= 0]
+    blank = np.full(len(log), np.nan)
+    command, position = (
+        np.column_stack([log.channels.get(f"{channel}.{j}", blank) for j in index.joints])[None]
+        for channel in ("command", "position")
+    )
+    law = ServoLaw.of(BatchModel(model, index, model.opt.timestep, 1))
+    torque = law.torque(command, position, np.zeros(position.shape))[0]
+    found = {j: torque[:, index.joints.index(j)] for j in driven if log.has("position", j) and log.has("command", j)}
+    return {joint: column[np.isfinite(column)] for joint, column in found.items()}

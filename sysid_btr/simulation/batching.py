@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.replay import CHUNK, CHUNK_DOFS, Replay
-from sysid_btr.simulation.setup import set_out, write_model
+from sysid_btr.simulation.setup import write_terms
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import BatchModel, Outputs
 
@@ -69,38 +68,29 @@ def batched_chunks(
 
 
 def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ...]:
-    from mujoco.batch import Batch
-
     lead, m = replays[0], len(candidates)
-    logs = len(replays)
-    batch = Batch(lead.model, m * logs, lead.threads)
-    rig = BatchModel(lead.model, batch, lead.index, lead.numerics.timestep)
-    shares = [slice(i * m, (i + 1) * m) for i in range(logs)]
-    for name in sorted({n for r in replays[1:] for n in _different(lead.model, r.model) or ()}):
-        array = rig.array(name)
-        for share, replay in zip(shares, replays, strict=True):
-            array[share] = getattr(replay.model, name)
+    logs, grids = len(replays), [replay.grid for replay in replays]
+    differing = sorted({n for r in replays[1:] for n in _different(lead.model, r.model) or ()})
+    numbers = {n: np.repeat(np.stack([getattr(r.model, n) for r in replays]), m, axis=0) for n in differing}
+    batch = BatchModel(lead.model, lead.index, lead.numerics.timestep, m * logs, numbers)
     values_of = lead._values(candidates)
     pairs = [(term, np.tile(values, (logs, 1, 1))) for term, values in values_of]
-    write_model(rig, pairs)
-    grids = [replay.grid for replay in replays]
+    write_terms(batch, pairs)
     steps = max(grid.steps for grid in grids)
-    qpos = np.repeat(np.stack([r.start[0] for r in replays]), m, axis=0)
-    qvel = np.repeat(np.stack([r.start[1] for r in replays]), m, axis=0)
+    qpos, qvel = (np.repeat(np.stack([r.start[i] for r in replays]), m, axis=0) for i in (0, 1))
     last = np.minimum(np.arange(steps), np.array([[g.steps - 1] for g in grids]))
     command = np.repeat(np.stack([g.command[k] for g, k in zip(grids, last, strict=True)]), m, axis=0)
-    command, applied = set_out(rig, pairs, qpos, qvel, command, steps)
+    own_logs = [(r.log, g) for r, g in zip(replays, grids, strict=True)]
+    setup = lead._prepare(batch, pairs, qpos, qvel, command, own_logs)
     # borders that any of the logs wants to see
-    state = np.unique(np.concatenate([grid.state for grid in grids]))
-    whole = Grid(rig.timestep, np.empty((steps, 0)), grids[0].sample_time, state, state, state, np.zeros(0))
-    states = lead.integrate(
-        rig, pairs, command, applied, whole, [(r.log, g) for r, g in zip(replays, grids, strict=True)]
-    )
+    borders = np.unique(np.concatenate([grid.state for grid in grids]))
+    states = lead.simulate(setup, borders)
     result = []
-    for share, replay, grid in zip(shares, replays, grids, strict=True):
-        own = states.of(share, np.searchsorted(state, grid.state))
+    for i, (replay, grid) in enumerate(zip(replays, grids, strict=True)):
+        share = slice(i * m, (i + 1) * m)
+        own = states.of(share, np.searchsorted(borders, grid.state))
         own.repeat_last_effort()
-        result.append(replay.read(rig, share, values_of, own, command[share, : grid.steps], grid))
+        result.append(replay.read(setup, share, values_of, own, grid))
     return tuple(result)
 
 

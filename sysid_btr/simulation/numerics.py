@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+MUJOCO = "mujoco"
+"""Name of the built-in simulator."""
 
 
 @dataclass(frozen=True)
@@ -10,15 +14,21 @@ class Numerics:
     """How the equations are integrated: MuJoCo's integrator by name, and the step in s.
 
     With `servo_period` (s, a multiple of the step) the servos compute their torque once a period and hold it;
-    without, they act as MuJoCo's own do, at every evaluation of the dynamics.
+    without, they act as MuJoCo's own do, at every evaluation of the dynamics. `simulator` is the name of what moves the
+    model, see `simulation.registry`.
     """
 
     integrator: str
     timestep: float
     servo_period: float | None = None
+    simulator: str = MUJOCO
 
     def halved(self) -> Numerics:
-        return Numerics(self.integrator, self.timestep / 2, self.servo_period)
+        return replace(self, timestep=self.timestep / 2)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in files: the simulator where it is not the built-in one."""
+        return {name: value for name, value in asdict(self).items() if (name, value) != ("simulator", MUJOCO)}
 
     @property
     def held_steps(self) -> int:
@@ -27,4 +37,5 @@ class Numerics:
 
     def __str__(self) -> str:
         held = f", servo torque updated every {1e3 * self.servo_period:g} ms" if self.servo_period else ""
-        return f"{self.integrator} {1e3 * self.timestep:g} ms{held}"
+        other = "" if self.simulator == MUJOCO else f", simulated by {self.simulator}"
+        return f"{self.integrator} {1e3 * self.timestep:g} ms{held}{other}"

@@ -10,19 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.mujoco_conventions import free_joints, to_quaternion, to_rotation
-from sysid_btr.simulation.grid import Grid
+from sysid_btr.simulation.grid import Grid, step_inputs
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.simulation.setup import write_model
-from sysid_btr.terms.base import BatchModel, Outputs, Term
-
-if TYPE_CHECKING:
-    from mujoco.batch import Batch
+from sysid_btr.simulation.setup import Setup, Values, prepare
+from sysid_btr.terms.base import Fields, Outputs
 
 SIMULATIONS = 96
 """Simulations of one batch."""
@@ -243,51 +239,10 @@ class WindowReplay(Replay):
                     ),
                 )
 
-    def _block(self, pairs: list[tuple[Term, FloatArray]], window: IntArray, change: FloatArray | None) -> Outputs:
+    def _block(self, pairs: Values, window: IntArray, change: FloatArray | None) -> Outputs:
         """One batch of simulations that share their sample times."""
-        from mujoco.batch import Batch
-
         frame = self._frames[window[0]]
-        h, grid = self.grid.timestep, self.grid
-        steps = max(int(frame.after[-1]), 1)
-        starts = self._windows.chosen(window)
-        if change is not None:
-            starts = starts.moved(change[:, : starts.std.shape[1]])
-        if frame.late:
-            late = np.zeros_like(starts.std)
-            joints = starts.joint_position.shape[1]
-            late[:, :3], late[:, 3:6] = -frame.late * starts.velocity, -frame.late * starts.rate
-            late[:, BASE : BASE + joints] = -frame.late * starts.joint_velocity
-            starts = starts.moved(late)
-        size = len(window)
-        batch = Batch(self.model, size, self.threads)
-        rig = BatchModel(self.model, batch, self.index, h)
-        write_model(rig, pairs)
-        if "opt.gravity" in rig.touched:
-            starts = on_slope(starts, np.array(self.model.opt.gravity), np.array(rig.array("opt.gravity")))
-        qpos, qvel = starts.joint_position.copy(), starts.joint_velocity.copy()
-        first = np.array([self._frames[w].first for w in window])
-        lead = round(LEAD / h)
-        rows = np.clip(first[:, None] + np.arange(-lead, steps), 0, grid.steps - 1)
-        command: FloatArray = grid.command[rows]
-        applied: FloatArray | None = None
-        for term, values in pairs:
-            term.initial_state(rig, values, qpos, qvel)
-            command = term.shape_command(rig, values, command)
-            if type(term).overrides("applied_torque"):
-                torque = term.applied_torque(rig, values, h * (first[0] + np.arange(steps + 1)))
-                if torque is not None:
-                    applied = torque if applied is None else applied + torque
-        self.push(batch, window, change)
-        index = self.index
-        place, motion = self._free_joint
-        bind_qpos, bind_qvel = batch.bind("qpos"), batch.bind("qvel")
-        bind_qpos[:, place : place + 3] = starts.position
-        bind_qpos[:, place + 3 : place + 7] = starts.quaternion
-        bind_qvel[:, motion : motion + 3] = starts.velocity
-        bind_qvel[:, motion + 3 : motion + 6] = starts.rate
-        bind_qpos[:, index.qpos] = qpos
-        bind_qvel[:, index.dof] = qvel
+        h, steps = self.grid.timestep, max(int(frame.after[-1]), 1)
         local = Grid(
             timestep=h,
             command=np.empty((steps, 0)),
@@ -297,10 +252,47 @@ class WindowReplay(Replay):
             after=frame.after,
             fraction=frame.fraction,
         )
-        return self._go(rig, pairs, command[:, lead:], applied, local)
+        return self._go(self._setup(pairs, window, change, steps), pairs, local)
 
-    def push(self, batch: Batch, window: IntArray, change: FloatArray | None) -> None:
-        """Let forces from outside act on a batch of windows; none do here."""
+    def _setup(self, pairs: Values, window: IntArray, change: FloatArray | None, steps: int) -> Setup:
+        """Windows from their initial states, with `change` added to these."""
+        frame, h = self._frames[window[0]], self.grid.timestep
+        starts = self._windows.chosen(window)
+        if change is not None:
+            starts = starts.moved(change[:, : starts.std.shape[1]])
+        if frame.late:
+            late = np.zeros_like(starts.std)
+            joints = starts.joint_position.shape[1]
+            late[:, :3], late[:, 3:6] = -frame.late * starts.velocity, -frame.late * starts.rate
+            late[:, BASE : BASE + joints] = -frame.late * starts.joint_velocity
+            starts = starts.moved(late)
+        batch = self.batch(pairs, len(window))
+        if "opt.gravity" in batch.fields:
+            starts = on_slope(starts, np.array(self.model.opt.gravity), batch.read("opt.gravity"))
+        first = np.array([self._frames[w].first for w in window])
+        lead = round(LEAD / h)
+        rows = np.clip(first[:, None] + np.arange(-lead, steps), 0, self.grid.steps - 1)
+        setup = prepare(
+            batch,
+            pairs,
+            starts.joint_position.copy(),
+            starts.joint_velocity.copy(),
+            self.grid.command[rows],
+            self.numerics,
+            inputs=lambda: {n: values[rows[:, lead:].T] for n, values in step_inputs(self.log, self.grid).items()},
+            effort=self.effort,
+            first=int(first[0]),
+            lead=lead,
+        )
+        place, motion = self._free_joint
+        qpos, qvel = setup.state["qpos"], setup.state["qvel"]
+        qpos[:, place : place + 3], qpos[:, place + 3 : place + 7] = starts.position, starts.quaternion
+        qvel[:, motion : motion + 3], qvel[:, motion + 3 : motion + 6] = starts.velocity, starts.rate
+        return replace(setup, state={**setup.state, **self.push(window, change)})
+
+    def push(self, window: IntArray, change: FloatArray | None) -> Fields:
+        """Forces from outside on a batch of windows, as in MjData; none here."""
+        return {}
 
     @cached_property
     def _free_joint(self) -> tuple[int, int]:

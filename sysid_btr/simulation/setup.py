@@ -1,49 +1,138 @@
-"""Putting a batch where its rollout begins."""
+"""What is rolled out: candidates of a model, their initial states, and what acts on them, as values of no engine."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import BatchModel, Term
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.terms.base import BatchModel, Fields, JointAddresses, Term
+
+if TYPE_CHECKING:
+    import mujoco
+
+Values = Sequence[tuple[Term, FloatArray]]
+"""Terms with their values, (m, places, kinds)."""
 
 
-def write_model(rig: BatchModel, pairs: Sequence[tuple[Term, FloatArray]]) -> None:
-    """Write the model fields of every candidate, and what MuJoCo derives from them."""
+class Law(NamedTuple):
+    """A term that acts at every step: its values (m, places, kinds), and its places among the joints."""
+
+    term: Term
+    values: FloatArray
+    places: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """All that a simulator needs to know of some candidates.
+
+    Attributes
+    ----------
+    batch : compiled model, addresses of the joints, step, and the fields in which the candidates differ.
+    state : MjData field -> (m, ...) at the start; what is not named is as `mj_resetData` leaves it, and only the
+        state moves: forces in it (`xfrc_applied`) act all the time.
+    command : (m, steps, j) as they reach the servos, held over each step.
+    applied : (m, steps, j) torques at the joints known in advance, Nm or N.
+    laws : terms that act at every step, in the order in which they do.
+    inputs : measured inputs of the drives, (steps, m) each, for laws.
+    held_steps : steps for which servos hold a torque; 0 where they act continuously.
+    effort : whether the torques of the servos are asked for.
+    """
+
+    batch: BatchModel
+    state: Fields
+    command: FloatArray
+    applied: FloatArray | None = None
+    laws: tuple[Law, ...] = ()
+    inputs: dict[str, FloatArray] = field(default_factory=dict)
+    held_steps: int = 0
+    effort: bool = False
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self.batch.model
+
+    @property
+    def index(self) -> JointAddresses:
+        return self.batch.index
+
+    @property
+    def size(self) -> int:
+        """Number of candidates."""
+        return self.batch.size
+
+    @property
+    def steps(self) -> int:
+        return int(self.command.shape[1])
+
+
+def write_terms(batch: BatchModel, pairs: Values) -> BatchModel:
+    """Write the model fields of every candidate."""
     for term, values in pairs:
-        rig.write(term.model_fields(rig, values))
-    if rig.touched & set(_setconst_inputs()):
-        rig.simulations.set_const()
+        batch.write(term.model_fields(batch, values))
+    return batch
 
 
-def set_out(
-    rig: BatchModel,
-    pairs: Sequence[tuple[Term, FloatArray]],
+def prepare(
+    batch: BatchModel,
+    pairs: Values,
     qpos: FloatArray,
     qvel: FloatArray,
     command: FloatArray,
-    steps: int,
-) -> tuple[FloatArray, FloatArray | None]:
-    """Put the batch where its replay begins: commands as they reach the servos, and torques known in advance.
+    numerics: Numerics,
+    *,
+    inputs: Callable[[], dict[str, FloatArray]] = dict,
+    effort: bool = False,
+    first: int = 0,
+    lead: int = 0,
+) -> Setup:
+    """What terms make of initial states, commands and torques, once their fields are written.
 
-    `qpos` and `qvel` are (m, joints), `command` is (m, steps, joints); terms may change all of them.
+    Parameters
+    ----------
+    batch, pairs : the candidates, and the terms they differ in.
+    qpos, qvel : (m, j) initial state of the joints of the log; terms may change it in place.
+    command : (m, lead + steps, j) as logged.
+    numerics : with which the model was compiled.
+    inputs : gives the measured inputs of the drives, (steps, m) each, where a law asks for them.
+    effort : whether the torques of the servos are asked for.
+    first : steps on the clock of the log before the first one, for torques known in advance.
+    lead : commands from before the first step, that reach into it when they are delayed.
     """
     applied: FloatArray | None = None
-    border_time = rig.timestep * np.arange(steps + 1, dtype=np.float64)
+    border_time = batch.timestep * (first + np.arange(command.shape[1] - lead + 1, dtype=np.float64))
     for term, values in pairs:
-        term.initial_state(rig, values, qpos, qvel)
-        command = term.shape_command(rig, values, command)
-        torque = term.applied_torque(rig, values, border_time)
+        term.initial_state(batch, values, qpos, qvel)
+        command = term.shape_command(batch, values, command)
+        torque = term.applied_torque(batch, values, border_time)
         if torque is not None:
             applied = torque if applied is None else applied + torque
-    rig.simulations.bind("qpos")[:, rig.index.qpos] = qpos
-    rig.simulations.bind("qvel")[:, rig.index.dof] = qvel
-    return command, applied
+    laws = [Law(term, values, _places(batch.index, term)) for term, values in pairs if type(term).overrides("law")]
+    # what a servo does comes before what depends on it
+    laws.sort(key=lambda law: law.term.law_acts == ("friction",))
+    state = {name: np.zeros((batch.size, size)) for name, size in (("qpos", batch.model.nq), ("qvel", batch.model.nv))}
+    state["qpos"][:] = batch.model.qpos0
+    state["qpos"][:, batch.index.qpos], state["qvel"][:, batch.index.dof] = qpos, qvel
+    return Setup(
+        batch,
+        {**state, **batch.state},
+        command[:, lead:],
+        applied,
+        tuple(laws),
+        inputs() if laws else {},
+        numerics.held_steps,
+        effort,
+    )
 
 
-def _setconst_inputs() -> Sequence[str]:
-    import mujoco
-
-    return tuple(mujoco.MjModel._setconst_inputs)
+def _places(index: JointAddresses, term: Term) -> IntArray:
+    """Positions of a term's places among the joints; every joint for the whole robot."""
+    known = set(index.joints)
+    if all(place in known for place in term.places):
+        return index.of(term.places)
+    return np.arange(len(index.joints))

@@ -7,6 +7,7 @@ once; ``values`` always has the shape (candidates, places, kinds).
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -17,8 +18,6 @@ from sysid_btr._typing import FloatArray, IntArray
 
 if TYPE_CHECKING:
     import mujoco
-    from mujoco.batch import Batch
-
 
 LINK_SUFFIX = "__link"
 """Name ending of what play or compliance adds on the link side of a joint: a second joint, a tendon."""
@@ -88,46 +87,62 @@ Fields = dict[str, FloatArray]
 """Compiled model field by name -> its values under each candidate, (candidates, ...)."""
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class BatchModel:
-    """The models of a batch of simulations that is being set up: one compiled model, and what candidates change in it.
+    """The models of some candidates: one compiled model, and what each of them changes in it.
 
     Attributes
     ----------
     model : compiled, without what candidates change.
-    simulations : the batch, of which each simulation has one candidate's numbers.
     index, timestep : addresses of joints, and s.
-    touched : names of the fields that are no longer the compiled model's.
+    size : number of candidates.
+    fields : compiled fields that are no longer the model's.
+    state : MjData fields with which a simulation begins, other than those of the joints of the log.
     """
 
     model: mujoco.MjModel
-    simulations: Batch
     index: JointAddresses
     timestep: float
-    touched: set[str] = field(default_factory=set)
+    size: int
+    fields: Fields = field(default_factory=dict)
+    state: Fields = field(default_factory=dict)
 
     def read(self, name: str) -> Any:
         """A copy of a compiled field's present values (`opt.gravity` for one of the options), (candidates, ...)."""
-        present = self.simulations.expanded(name)
-        if present is not None:
-            return present.copy()
-        shared = getattr(self.model.opt, name[4:]) if name.startswith("opt.") else getattr(self.model, name)
-        return np.tile(shared, (self.size, *(1,) * np.ndim(shared)))
+        if name in self.fields:
+            return self.fields[name].copy()
+        shared = self._compiled(name)
+        return np.tile(shared, (self.size, *(1,) * shared.ndim))
 
     def write(self, fields: Fields) -> None:
         """Let fields have these values."""
         for name, values in fields.items():
-            self.array(name)[...] = values
+            shared = self._compiled(name)
+            self.fields[name] = np.array(np.broadcast_to(values, (self.size, *shared.shape)), dtype=shared.dtype)
 
-    def array(self, name: str) -> Any:
-        """Live per-candidate values of a compiled field, to be written at every step."""
-        self.touched.add(name)
-        return self.simulations.expand(name)
+    def candidate(self, row: int) -> mujoco.MjModel:
+        """A compiled model of one candidate's own, with what MuJoCo derives from its fields."""
+        import mujoco
+
+        own = copy.copy(self.model)
+        for name, values in self.fields.items():
+            if name.startswith("opt."):
+                setattr(own.opt, name[4:], values[row])
+            else:
+                getattr(own, name)[...] = values[row]
+        if self.derives:
+            mujoco.mj_setConst(own, mujoco.MjData(own))
+        return own
 
     @property
-    def size(self) -> int:
-        """Number of candidates."""
-        return int(self.simulations.nsim)
+    def derives(self) -> bool:
+        """Whether MuJoCo derives others from the changed fields."""
+        import mujoco
+
+        return not self.fields.keys().isdisjoint(mujoco.MjModel._setconst_inputs)
+
+    def _compiled(self, name: str) -> Any:
+        return np.asarray(getattr(self.model.opt, name[4:]) if name.startswith("opt.") else getattr(self.model, name))
 
 
 @dataclass

@@ -42,7 +42,8 @@ class FilledBuffers(Term):
         sizes = [int(model.actuator_history[a, 0]) if a >= 0 else 0 for a in batch.index.actuator]
         if not any(sizes):
             return command
-        data, history = mujoco.MjData(model), batch.simulations.bind("history")
+        data = mujoco.MjData(model)
+        history = batch.state["history"] = np.tile(data.history, (batch.size, 1))
         for s in range(batch.size):
             for joint, size in enumerate(sizes):
                 if size:

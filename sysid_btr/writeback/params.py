@@ -48,7 +48,7 @@ def read_params(path: Path, robot: Robot) -> Params:
     UsageError
         If it cannot be read, or names what this robot or this version does not have; all of it at once.
     """
-    from sysid_btr.simulation.numerics import Numerics
+    from sysid_btr.simulation.numerics import MUJOCO, Numerics
 
     file = path / PARAMS if path.is_dir() else path
     try:
@@ -67,7 +67,9 @@ def read_params(path: Path, robot: Robot) -> Params:
             term = _term(entry, places, problems, robot)
             if term is not None:
                 parts.append((term, [float(p["value"]) for p in entry["parameters"]]))
-        numerics = Numerics(str(content["numerics"]["integrator"]), float(content["numerics"]["timestep"]))
+        own = {"servo_period": None, "simulator": MUJOCO, **content["numerics"]}
+        period = None if own["servo_period"] is None else float(own["servo_period"])
+        numerics = Numerics(str(own["integrator"]), float(own["timestep"]), period, str(own["simulator"]))
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(
             f"--params {file} was changed and cannot be read: {error!r}; give one as it was written"

@@ -63,25 +63,21 @@ def make_target(robot: Robot, log: Log, parts: Sequence[Part], numerics: Numeric
     parts, numerics : what is written.
     """
     import mujoco
-    from mujoco.batch import Batch
 
     writing = tuple(p.stand_in for p in parts if p.stand_in is not None)
     replayed = compile_model(robot, log, writing, numerics)
-    rig = BatchModel(replayed, Batch(replayed, 1, 1), make_index(replayed), numerics.timestep)
+    batch = BatchModel(replayed, make_index(replayed), numerics.timestep, 1)
     fields: list[frozenset[str]] = []
-    before: set[str] = set()
     for part in parts:
-        rig.touched.clear()
-        if part.stand_in is not None:
-            rig.write(part.stand_in.model_fields(rig, part.values))
-        fields.append(frozenset(rig.touched))
-        before |= rig.touched
+        written = {} if part.stand_in is None else part.stand_in.model_fields(batch, part.values)
+        batch.write(written)
+        fields.append(frozenset(written))
     model = replayed
     if log.meta.mount == "fixed":
         free = replace(log, meta=replace(log.meta, mount="free"))
         model = compile_model(robot, free, writing, numerics)
-    for name in before:
-        _put(model, name, np.asarray(rig.simulations.expanded(name)[0]))
+    for name, values in batch.fields.items():
+        _put(model, name, values[0])
     with silenced():
         mujoco.mj_setConst(model, mujoco.MjData(model))
     held = tuple(_as_written(part, own) for part, own in zip(parts, fields, strict=True))

@@ -325,7 +325,7 @@ def params_of(model: Identified) -> dict[str, Any]:
     return {
         "schema": PARAMS_SCHEMA,
         "model": model.study.robot.to_dict(),
-        "numerics": asdict(model.study.numerics),
+        "numerics": model.study.numerics.to_dict(),
         "modifiers": entries,
     }
 

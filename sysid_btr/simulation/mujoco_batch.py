@@ -1,0 +1,85 @@
+"""The built-in simulator: MuJoCo on the cores of this machine, a candidate's numbers in each simulation of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.simulation.setup import Setup
+from sysid_btr.simulation.simulator import States
+from sysid_btr.simulation.stepping import step_through
+from sysid_btr.terms.base import BatchModel, Fields
+
+if TYPE_CHECKING:
+    from mujoco.batch import Batch
+
+SEGMENT = 1024
+"""Steps per rollout call; bounds the records that are held at once."""
+POSITION, ACCELERATION = 1, 3
+"""Stages of MuJoCo's forward dynamics (mjtStage)."""
+
+
+@dataclass(frozen=True)
+class MujocoBatch:
+    """Simulations of a `mujoco.batch.Batch`, on as many threads as are asked for."""
+
+    def rollout(self, setup: Setup, borders: IntArray, *, threads: int = 0) -> States:
+        batch = _load(setup.batch, setup.state, threads)
+        if setup.laws or setup.held_steps:
+            states = step_through(setup, borders, batch.expand, batch.bind, batch.step)
+        else:
+            states = _roll(batch, setup, borders)
+        states.failed = batch.warning[:, :, 1].sum(axis=1) > 0
+        return states
+
+
+def evaluate(
+    batch: BatchModel, state: Fields, names: Sequence[str], *, stage: int = ACCELERATION, threads: int = 0
+) -> Fields:
+    """What MuJoCo derives from given states: fields of MjData by name, (m, ...) each, computed up to a stage."""
+    simulations = _load(batch, state, threads)
+    found = {name: simulations.bind(name) for name in names}
+    simulations.forward(stage=stage)
+    return {name: values.copy() for name, values in found.items()}
+
+
+def _load(batch: BatchModel, state: Fields, threads: int) -> Batch:
+    """A batch with the candidates' numbers in it."""
+    from mujoco.batch import Batch
+
+    simulations = Batch(batch.model, batch.size, threads)
+    for name, values in batch.fields.items():
+        simulations.expand(name)[...] = values
+    if batch.derives:
+        simulations.set_const()
+    for name, values in state.items():
+        simulations.bind(name)[...] = values
+    return simulations
+
+
+def _roll(batch: Batch, setup: Setup, borders: IntArray) -> States:
+    """All steps in one call of the engine, or in a few: memory stays bounded whatever the length of the log."""
+    import mujoco
+
+    index, nu, nv = setup.index, setup.model.nu, setup.model.nv
+    states = States.empty(setup.size, len(borders), index)
+    states.put(index, np.array([0]), batch.bind("qpos")[:, None], batch.bind("qvel")[:, None])
+    spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
+    if setup.applied is not None:
+        spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED.value)
+    driven = index.actuator >= 0
+    for first in range(0, setup.steps, SEGMENT):
+        last = min(first + SEGMENT, setup.steps)
+        control: FloatArray = np.zeros((setup.size, last - first, nu + (0 if setup.applied is None else nv)))
+        control[:, :, index.actuator[driven]] = setup.command[:, first:last, driven]
+        if setup.applied is not None:
+            control[:, :, nu + index.dof] = setup.applied[:, first:last]
+        records = batch.rollout(last - first, control, spec, record=("qpos", "qvel"))
+        wanted = np.flatnonzero((borders > first) & (borders <= last))
+        local = borders[wanted] - first - 1
+        states.put(index, wanted, records["qpos"][:, local], records["qvel"][:, local])
+    return states
