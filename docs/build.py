@@ -23,7 +23,8 @@ from pdoc.render_helpers import to_html
 
 import sysid_btr
 import sysid_btr.posterior
-from sysid_btr.terms.library import EFFECTS
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.library import effects
 
 HERE = Path(__file__).parent
 TITLES = {
@@ -98,21 +99,27 @@ def effects_page() -> str:
     lines = [
         "# Effects",
         "",
-        "`close` looks for these by itself. `--effects NAME,NAME` confines it to some. An effect that leaves the same "
-        "trace as another is told from it only by the motion or sensor in the last column; without that the verdict is "
-        "`ambiguous`.",
+        "`close` looks for these by itself, but for factors of what a model states anyway (*declared*). `--effects "
+        "NAME,NAME` confines it to some, or asks for one of those too. An effect that leaves the same trace as another "
+        "is told from it only by the motion or sensor in the last column; without that the verdict is `ambiguous`.",
         "",
-        "| name | what | at | parameters (unit) | mistaken for, unless the log has |",
-        "|---|---|---|---|---|",
+        "All of them can be freed: `--fit NAME:GLOB`, or `--fit NAME.PARAMETER:GLOB` for one parameter alone. The name "
+        "of a model's own value stands for that value instead of a change of it.",
+        "",
+        "| name | other names | what | at | parameters (unit) | mistaken for, unless the log has |",
+        "|---|---|---|---|---|---|",
     ]
-    by_name: dict[str, list[type]] = {}
-    for effect in EFFECTS:
+    by_name: dict[str, list[type[Effect]]] = {}
+    for effect in effects():
         by_name.setdefault(effect.name, []).append(effect)
     for name, variants in by_name.items():
-        first = EFFECTS[EFFECTS.index(variants[0])]
+        first = variants[0]
         kinds = ", ".join(f"{k.name} ({'-' if k.unit == '1' else k.unit})" for k in first.kinds)
         confounders = "; ".join(f"`{other}`: {what}" for other, what in first.confounders) or "-"
-        lines.append(f"| `{name}` | {first.title} | {first.scope} | {kinds} | {confounders} |")
+        own = [f"`{first.field}` (own value)"] if first.field else []
+        others = ", ".join([*own, *(f"`{n}`" for n in first.also)]) or "-"
+        what = first.title if first.usual else f"{first.title} (declared)"
+        lines.append(f"| `{name}` | {others} | {what} | {first.scope} | {kinds} | {confounders} |")
     return "\n".join(lines) + "\n"
 
 

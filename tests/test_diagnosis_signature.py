@@ -33,7 +33,7 @@ from sysid_btr.terms.disturbance import (
 )
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction
-from sysid_btr.terms.library import EFFECTS
+from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.transmission import Cogging
 
@@ -78,7 +78,7 @@ def torques_of(log: Log) -> dict[str, MissingTorque]:
     return {t.joint: t for t in missing_torques(study.train_problem(()), NOTHING, study.scales)}
 
 
-def asked(log: Log, library: Sequence[type[Effect]] = EFFECTS) -> list[Perturbation]:
+def asked(log: Log, library: Sequence[type[Effect]] = select_effects(["all"])) -> list[Perturbation]:
     study = study_of(log)
     problem = study.train_problem(())
     return proposals(study, problem, NOTHING, problem.residuals(np.zeros((1, 0)))[0], library)

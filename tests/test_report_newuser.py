@@ -120,7 +120,7 @@ def test_a_table_in_degrees_is_imported_from_python(tmp_path: Path) -> None:
         ((*ASKED, "--bounds", "kpp=0.5:2"), 2, "did you mean 'kp'"),
         ((*ASKED, "--bounds", "mass:leg=0.5:2"), 2, "arm"),
         ((*ASKED, "--bounds", "com.w:arm=0:1"), 2, "it has x, y, z"),
-        ((*ASKED, "--fit", "coulomb_friction:pendulum"), 2, "did you mean 'frictionloss'"),
+        ((*ASKED, "--fit", "friction:pendulum"), 2, "did you mean 'frictionloss'"),
         (("--model", RECORDED, "--log", RECORDED, "--fit", "mass:*"), 4, "a log with --log"),
         (("--model", MODEL, "--log", MODEL, "--fit", "mass:*"), 3, "give it with --model"),
         (("--config", "{mapping}"), 2, "a mapping for `sysid-btr import`"),

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from toys import LEG, LEG_JOINTS, leg, make_log, position, robot_from_xml, run, swing, with_spec
 
-from sysid_btr.terms.fields import FIELDS, nominal_value
 from sysid_btr.terms.grammar import parse_parameters
 
 LOG = swing(LEG_JOINTS, seconds=0.6)
@@ -89,14 +88,6 @@ def test_mass_takes_the_inertia_along_and_inertia_leaves_the_mass() -> None:
     assert np.abs(point - position(robot, LOG)).max() > 1e-4
 
 
-@pytest.mark.parametrize("field", sorted(FIELDS))
-def test_the_nominal_value_of_every_field_is_the_plain_model(field: str) -> None:
-    robot = leg()
-    place = "ankle" if field == "foot_friction" else "knee"
-    terms = parse_parameters([f"{field}:{place}"], robot)
-    np.testing.assert_allclose(position(robot, LOG, terms), position(robot, LOG), rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("field", "place", "value"),
     [
@@ -107,7 +98,6 @@ def test_the_nominal_value_of_every_field_is_the_plain_model(field: str) -> None
     ],
 )
 def test_absolute_fields_start_from_the_model(field: str, place: str, value: float) -> None:
-    assert nominal_value(field, leg().compile(), place) == pytest.approx(value)
     assert parse_parameters([f"{field}:{place}"], leg())[0].parameters[0].nominal == pytest.approx(value)
 
 

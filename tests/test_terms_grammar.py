@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,8 +13,8 @@ from toys import SCALE, leg, pendulum
 from sysid_btr.errors import UsageError
 from sysid_btr.models.emps import emps
 from sysid_btr.models.nao import PAPER_BOUNDS, STARRED, nao
-from sysid_btr.terms.fields import FIELDS
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.library import declarable
 from sysid_btr.terms.scales import JointScale
 
 LEG = leg()
@@ -40,6 +41,30 @@ def test_shared_is_one_number_for_all_matches() -> None:
 
 def test_a_centre_of_mass_is_three_numbers_a_body() -> None:
     assert names("com:knee") == ["com.x:knee", "com.y:knee", "com.z:knee"]
+    assert names("com.z:knee", "com.x:knee") == ["com.z:knee", "com.x:knee"]
+
+
+def test_a_name_of_the_models_own_value_and_one_of_its_change_are_one_term() -> None:
+    (own,) = parse_parameters(["damping:knee"], LEG)
+    (change,) = parse_parameters(["viscous_damping:knee"], LEG)
+    assert type(own) is type(change)
+    assert (own.absolute, change.absolute) == (True, False)
+    assert [m.parameters[0].nominal for m in (own, change)] == [0.05, 0.0]
+    with pytest.raises(UsageError, match=r"viscous_damping:knee is already declared by 'damping:\*'"):
+        parse_parameters(["damping:*", "viscous_damping:knee"], LEG)
+
+
+def test_every_effect_can_be_freed_whole_in_part_and_by_its_variant() -> None:
+    assert names("backlash:k*") == ["backlash.play:knee", "backlash.softness:knee"]
+    (part,) = parse_parameters(["backlash.play:*=shared"], LEG, {"knee": SCALE})
+    assert [p.name for p in part.parameters] == ["backlash.play:*"]
+    assert part.spread(np.array([[0.02]])).tolist() == [[[0.02, 0.0]] * 3]
+    (motor,) = parse_parameters(["backlash.motor:knee"], LEG)
+    assert motor.variant == "motor"
+    assert names("load_friction.stribeck.ratio:hip") == ["load_friction.stribeck.ratio:hip"]
+    assert names("gravity_tilt:*") == ["gravity_tilt.x:robot", "gravity_tilt.y:robot"]
+    with pytest.raises(UsageError, match="backlash has no 'slip'; it has play, softness"):
+        parse_parameters(["backlash.slip:knee"], LEG)
 
 
 @pytest.mark.parametrize(
@@ -93,11 +118,12 @@ def test_no_number_is_ever_freed_twice(expressions: list[str]) -> None:
     assert len(labels) == len(set(labels))
 
 
-@pytest.mark.parametrize("field", sorted(FIELDS))
+@pytest.mark.parametrize("field", sorted(declarable({})))
 @pytest.mark.parametrize("sized", [False, True])
 def test_bounds_hold_the_nominal_and_scales_are_positive(field: str, sized: bool) -> None:
     scales = {"knee": SCALE} if sized else None
-    for term in parse_parameters([f"{field}:knee"], LEG, scales):
+    place = "robot" if declarable({})[field].scope == "robot" and not field.startswith("foot_") else "knee"
+    for term in parse_parameters([f"{field}:{place}"], LEG, scales):
         for p in term.parameters:
             assert p.lower <= p.nominal <= p.upper
             assert p.lower < p.upper < float("inf")

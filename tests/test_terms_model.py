@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.fields import Com, Kp, Mass
 from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.inertial import ComOffset, Mass
 from sysid_btr.terms.model import Model, Terms, as_model
+from sysid_btr.terms.servo import Kp
 
-KINDS = (Mass, Com, Kp, CoulombFriction)
+KINDS = (Mass, ComOffset, Kp, CoulombFriction)
 
 
 @st.composite

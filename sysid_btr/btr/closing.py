@@ -19,7 +19,6 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot
 from sysid_btr.run_folder import Folder
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
@@ -110,7 +109,7 @@ def _look(
         message = "missing effects were not searched for: fewer than two trials have a log of their first seconds"
         return Joined(message), None
     declared = Model.of(stage.world.terms, values)
-    drives = [term for term in declared.terms if term.scope != "body"] or list(declared.terms)
+    drives = [term for term in declared.terms if term.location != "body"] or list(declared.terms)
     free = declared.only(*drives)
     effects = tuple(dict.fromkeys(e.name for e in select_effects(("all",)) if e.name not in SAME))
     try:
@@ -141,7 +140,7 @@ def _look(
     found, last, apart = _tell_apart(study, closing.model, len(free.terms), last)
     joining, spent = found.without(*free.terms), spent + apart * len(logs)
     fitted = [(term, found.own(term) if term in found.terms else own) for term, own in declared.parts]
-    added = "; ".join(f"{m.name} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
+    added = "; ".join(f"{m.called} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
     message = f"added to the model: {added}; {_score(first, last)}"
     return Joined(message, Model.joined([*fitted, *joining.parts]), spent), study
 
@@ -157,7 +156,7 @@ def _tell_apart(study: Study, found: Model, declared: int, left: float) -> tuple
 
     spent = 0
     for effect in found.terms[declared:]:
-        if not (isinstance(effect, Effect) and effect.shared):
+        if not effect.shared:
             continue
         trying = found.replaced(effect, (_own_amounts(effect), np.tile(found.own(effect), len(effect.places))))
         problem = MapProblem(study.train_problem(trying))
@@ -173,7 +172,7 @@ def _tell_apart(study: Study, found: Model, declared: int, left: float) -> tuple
     return found, left, spent
 
 
-def _own_amounts(effect: Effect) -> Effect:
+def _own_amounts(effect: Term) -> Term:
     """The effect with an amount for every place, within the bounds of the one for all."""
     bare = replace(effect, shared=False, known=())
     known = (*effect.parameters,) * len(effect.places)
@@ -182,7 +181,7 @@ def _own_amounts(effect: Effect) -> Effect:
 
 def _amounts(term: Term, values: FloatArray) -> str:
     """Values in words: each kind's, and where it has several places their range."""
-    own = np.reshape(values, (-1, len(term.kinds)))
+    own = np.reshape(values, (-1, len(term.numbers)))
     units = [p.unit for p in term.parameters]
     return ", ".join(
         f"{low:.3g} {unit}" if low == high else f"{low:.3g} to {high:.3g} {unit}"

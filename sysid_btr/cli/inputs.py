@@ -106,11 +106,11 @@ def check_freed(robot: Robot, fit: Sequence[str]) -> None:
 
 def _what_can_be_freed(robot: Robot) -> str:
     from sysid_btr.models.robot import body_names, joint_names, servo_joints
-    from sysid_btr.terms.fields import FIELDS
+    from sysid_btr.terms.library import declarable
 
     fields: dict[str, list[str]] = {}
-    for name, cls in {**FIELDS, **robot.fields}.items():
-        fields.setdefault(cls.scope, []).append(name)
+    for name, cls in declarable(robot.fields).items():
+        fields.setdefault(cls(places=(), declared=name).location, []).append(name)
     lines = [
         f"no parameters to fit: give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has",
     ]
@@ -118,8 +118,9 @@ def _what_can_be_freed(robot: Robot) -> str:
         ("body", body_names(robot)),
         ("joint", joint_names(robot)),
         ("servo", servo_joints(robot)),
+        ("robot", ("robot",)),
     ):
-        noun = {"body": "bodies", "joint": "joints", "servo": "joints with a servo"}[scope]
+        noun = {"body": "bodies", "joint": "joints", "servo": "joints with a servo", "robot": "the whole"}[scope]
         lines.append(f"  {', '.join(fields.get(scope, []))}\n    of {noun}: {', '.join(names) or 'none'}")
     lines.append("for example: --fit 'mass:*' --fit 'kp:*=shared'")
     return "\n".join(lines)

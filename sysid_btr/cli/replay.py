@@ -67,8 +67,8 @@ def _changed(robot: Robot, options: ReplayOptions) -> tuple[Model, Numerics | No
     if options.params is None:
         return model, None
     params = read_params(options.params, robot)
-    taken = {(m.name, place) for m in params.model.terms for place in m.places}
-    twice = [f"{m.name}:{place}" for m in model.terms for place in m.places if (m.name, place) in taken]
+    taken = {(m.called, place) for m in params.model.terms for place in m.places}
+    twice = [f"{m.called}:{place}" for m in model.terms for place in m.places if (m.called, place) in taken]
     if twice:
         raise UsageError(f"given by --set and by --params: {', '.join(twice)}; give one of the two")
     return Model.joined([*params.model.parts, *model.parts]), params.numerics

@@ -15,9 +15,9 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.subtrees import WHOLE_ROBOT
-from sysid_btr.terms.effect import Effect, Probe, middle_scale, scale_at
+from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.model import Model
-from sysid_btr.terms.scales import Scales
+from sysid_btr.terms.scales import Scales, middle_scale, scale_at
 
 FAINT = 1e-4
 """Squared response of a direction, relative to an effect's strongest one, below which it is not moved."""

@@ -19,8 +19,7 @@ from sysid_btr.objectives.targets import WARM_UP, Target
 from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.disturbance import ExternalDisturbanceTrain
-from sysid_btr.terms.effect import scale_at
-from sysid_btr.terms.scales import Scales
+from sysid_btr.terms.scales import Scales, scale_at
 
 MOST_SAMPLES = 8192
 """Longer episodes are averaged down to this many samples."""

@@ -60,8 +60,8 @@ def of_legs(problem: ReplayProblem) -> BoolArray:
     result: list[bool] = []
     for term in problem.terms:
         for places in term.grouped:
-            own = term.scope == "body" and not legs.isdisjoint(places)
-            result += [own or term.name.startswith("foot_")] * len(term.kinds)
+            own = term.location == "body" and not legs.isdisjoint(places)
+            result += [own or term.name.startswith("foot_")] * len(term.numbers)
     return np.array(result)
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.models.robot import Robot, robot_from_spec
-from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope
-from sysid_btr.terms.fields import FieldTerm, allow_any_inertia
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope, Term
+from sysid_btr.terms.inertial import allow_any_inertia
 
 if TYPE_CHECKING:
     import mujoco
@@ -47,7 +47,7 @@ UNKNOWN = ("LFFemur", "RFTibia", "RMFemur", "LRTibia")
 
 
 @dataclass(frozen=True)
-class SegmentLength(FieldTerm):
+class SegmentLength(Term):
     """Length of a capsule-shaped segment as a factor of the nominal; its mass follows, its radius stays."""
 
     name: ClassVar[str] = "length"

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import mujoco
 
     from sysid_btr.io.log import Log
-    from sysid_btr.terms.fields import FieldTerm
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Robot:
     always: tuple[Term, ...] = ()
     configure: Callable[[Robot, Log], Robot] | None = None
     priors: Mapping[str, str] = field(default_factory=dict)
-    fields: Mapping[str, type[FieldTerm]] = field(default_factory=dict)
+    fields: Mapping[str, type[Term]] = field(default_factory=dict)
 
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import facts_html

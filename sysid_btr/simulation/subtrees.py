@@ -72,7 +72,7 @@ def parameter_subtrees(terms: Sequence[Term], where: dict[str, int]) -> list[fro
     for term in terms:
         for group in term.grouped:
             found = frozenset(where.get(name, WHOLE_ROBOT) for name in group)
-            result += [frozenset() if WHOLE_ROBOT in found else found] * len(term.kinds)
+            result += [frozenset() if WHOLE_ROBOT in found else found] * len(term.numbers)
     return result
 
 

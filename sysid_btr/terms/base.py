@@ -1,4 +1,4 @@
-"""Parametrised changes of a model: the one mechanism behind declared parameters and effects.
+"""Parametrised changes of a model: what `--fit` frees, and what `close` finds to be missing.
 
 A `Term` owns a few parameters at a few places (joints, bodies, or the whole robot) and takes part in
 a replay at the stages it needs, by overriding the hooks below. All hooks act on a batch of candidates at
@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.terms.scales import JointScale, Scales, largest_scale
 
 if TYPE_CHECKING:
     import mujoco
@@ -46,7 +47,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Kind:
-    """What a modifier's parameter is, before it is tied to a place."""
+    """What a term's parameter is, before it is tied to a place."""
 
     name: str
     unit: str
@@ -54,6 +55,11 @@ class Kind:
     lower: float
     upper: float
     scale: float
+
+
+def parameter_of(kind: Kind, name: str) -> Parameter:
+    """A parameter of a kind, by name."""
+    return Parameter(name, kind.unit, kind.nominal, kind.lower, kind.upper, kind.scale)
 
 
 @dataclass(frozen=True)
@@ -204,22 +210,56 @@ class Term:
     places : joint or body names, or ``("robot",)``.
     shared : one set of parameters for all places instead of one each.
     known : the parameters with the nominal values and bounds of a robot, once these are known.
+    declared : name under which the user freed it; empty for what was added.
+    fixed : value of every kind, None where it is free; empty where all are.
     """
 
     places: tuple[str, ...]
     shared: bool = False
     known: tuple[Parameter, ...] = ()
+    declared: str = ""
+    fixed: tuple[float | None, ...] = ()
 
     name: ClassVar[str] = ""
     label: ClassVar[str] = ""
     """In the names of its parameters, where the name alone would not tell it from another one beside it."""
+    variant: ClassVar[str] = ""
+    """Tells apart two realisations under one name; empty for most."""
+    field: ClassVar[str] = ""
+    """Name under which its first kind is the model's own value: `frictionloss`, to which `coulomb_friction` adds."""
+    also: ClassVar[tuple[str, ...]] = ()
+    """Other names under which it can be freed."""
     kinds: ClassVar[tuple[Kind, ...]] = ()
     scope: ClassVar[Scope] = "joint"
     """What its places are."""
+    declared_at: ClassVar[Scope | None] = None
+    """What its places are where it is declared, if not that."""
     structural: ClassVar[bool] = False
     """Whether it adds joints to the model, which then has to be compiled for its places."""
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
     """What the law may change beside the joint torque: gain and motor torque, friction, limits."""
+
+    @property
+    def called(self) -> str:
+        """Its name in results."""
+        return self.declared or self.name
+
+    @property
+    def absolute(self) -> bool:
+        """Whether its number takes the place of the model's own instead of changing it."""
+        return self.declared == self.field != ""
+
+    @property
+    def location(self) -> Scope:
+        """What its places are."""
+        return self.declared_at if self.declared and self.declared_at else self.scope
+
+    @property
+    def numbers(self) -> tuple[Kind, ...]:
+        """The kinds of its parameters at one place."""
+        if self.absolute:
+            return self.kinds[:1]
+        return tuple(k for k, v in zip(self.kinds, self.fixed, strict=True) if v is None) if self.fixed else self.kinds
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -238,32 +278,59 @@ class Term:
         """The free numbers, place by place, kind by kind within a place."""
         if self.known:
             return self.known
-        result = []
-        for group in self.groups:
-            for kind in self.kinds:
-                name = self.label or self.name
-                label = name if len(self.kinds) == 1 else f"{name}.{kind.name}"
-                result.append(
-                    Parameter(
-                        f"{label}:{group}",
-                        kind.unit,
-                        kind.nominal,
-                        kind.lower,
-                        kind.upper,
-                        kind.scale,
-                    )
-                )
-        return tuple(result)
+        name, several = self.declared or self.label or self.name, len(self.numbers) > 1 or bool(self.fixed)
+        return tuple(
+            parameter_of(kind, f"{name}.{kind.name}:{group}" if several else f"{name}:{group}")
+            for group in self.groups
+            for kind in self.numbers
+        )
+
+    @property
+    def neutral(self) -> FloatArray:
+        """(parameters,) values at which the model is exactly the plain one."""
+        return np.array([p.nominal for p in self.parameters])
 
     def spread(self, values: FloatArray) -> FloatArray:
-        """Candidate numbers (m, parameters) as (m, places, kinds)."""
-        shaped = values.reshape(len(values), len(self.groups), len(self.kinds))
-        return np.broadcast_to(shaped, (len(values), len(self.places), len(self.kinds)))
+        """Candidate numbers (m, parameters) as (m, places, kinds); one kind alone where that is `absolute`."""
+        shaped = values.reshape(len(values), len(self.groups), len(self.numbers))
+        if self.fixed:
+            whole = np.tile(np.array(self.fixed, dtype=np.float64), (*shaped.shape[:2], 1))
+            whole[np.isnan(whole)] = shaped.ravel()
+            shaped = whole
+        return np.broadcast_to(shaped, (len(values), len(self.places), shaped.shape[2]))
 
     def spread_parameters(self, kind: int) -> tuple[Parameter, ...]:
         """The parameter of one kind for each place."""
-        own = self.parameters[kind :: len(self.kinds)]
+        own = self.parameters[kind :: len(self.numbers)]
         return own * len(self.places) if len(own) == 1 else own
+
+    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
+        """The model's own values (m, places) under this term's numbers: those instead, or those added."""
+        return values if self.absolute else present + values
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        """The kinds with nominal value, bounds and scale for one place."""
+        return cls.kinds
+
+    @classmethod
+    def own_value(cls, model: mujoco.MjModel, place: str) -> float:
+        """What the model has at a place of what `field` names; infinite for a limit that it has not."""
+        raise NotImplementedError(f"{cls.__name__} names a field and does not say what a model has of it")
+
+    @classmethod
+    def absolute_kind(cls, kind: Kind, own: float) -> Kind:
+        """The kind of the model's own value, given that of its change and what the model has."""
+        upper = max(kind.upper, 10 * own) if np.isfinite(own) else kind.upper
+        return replace(kind, nominal=min(own, upper), lower=min(kind.lower, own), upper=upper)
+
+    @classmethod
+    def at(cls, places: Sequence[str], scales: Scales, *, shared: bool = False) -> Self:
+        """The term at some places of a robot whose sizes are known."""
+        bare = cls(places=tuple(places), shared=shared and len(places) > 1)
+        kinds = (kind for group in bare.grouped for kind in cls.sized(largest_scale(scales, group)))
+        names = (p.name for p in bare.parameters)
+        return replace(bare, known=tuple(parameter_of(k, name) for k, name in zip(kinds, names, strict=True)))
 
     # --- hooks, in the order in which a replay calls them -------------------------------------------------
 

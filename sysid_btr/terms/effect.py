@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import Kind, Parameter, Term
-from sysid_btr.terms.scales import JointScale, Scales
+from sysid_btr.terms.base import BatchModel, Fields, Term
+from sysid_btr.terms.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
 
 LADDER = (0.3, 0.55, 1.0, 1.8, 3.0, 5.0)
 """Multiples of the scan's amount at which a refit may begin."""
@@ -30,10 +32,10 @@ class Effect(Term):
     ----------------
     name : as in results and on the command line.
     title : in a sentence, after an amount: "0.33 Nm of dry friction".
+    usual : whether it is looked for where the user names no effects.
     scope : which names it can sit at.
     confounders : effects that leave similar traces, and what tells them apart.
     needs : sensors without which it cannot be seen.
-    variant : tells apart two realisations under one name; empty for most.
     signed : whether its amounts may have either sign.
     main : kind whose value says how large the effect is.
     steps : amounts the scan tries, in units of the kind's scale; more than one where the response bends.
@@ -46,9 +48,9 @@ class Effect(Term):
     """
 
     title: ClassVar[str] = ""
+    usual: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = ()
     needs: ClassVar[str] = "position"
-    variant: ClassVar[str] = ""
     signed: ClassVar[bool] = False
     main: ClassVar[int] = 0
     held: ClassVar[tuple[str, ...]] = ()
@@ -78,11 +80,6 @@ class Effect(Term):
         return np.array(values)
 
     @classmethod
-    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        """The kinds with nominal value, bounds and scale for one place."""
-        return cls.kinds
-
-    @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         """Alternative working points of the scan at one place; each spans the effect linearly."""
         kinds = cls.sized(scale)
@@ -90,23 +87,6 @@ class Effect(Term):
             (tuple(k.nominal + step * k.scale if i == cls.main else k.nominal for i, k in enumerate(kinds)),)
             for step in cls.steps
         )
-
-    @classmethod
-    def at(cls, places: Sequence[str], scales: Scales, *, shared: bool = False) -> Self:
-        """The effect at some places of a robot whose sizes are known."""
-        bare = cls(places=tuple(places), shared=shared and len(places) > 1)
-        names = [p.name for p in bare.parameters]
-        known: list[Parameter] = []
-        for group in bare.groups:
-            members = [scale_at(scales, name) for name in group.split(",")]
-            largest = max(members, key=lambda s: s.torque_peak)
-            for kind in cls.sized(largest):
-                known.append(
-                    Parameter(
-                        names[len(known)], kind.unit, kind.nominal, kind.lower, kind.upper, kind.scale
-                    )
-                )
-        return replace(bare, known=tuple(known))
 
     def around(self, values: FloatArray) -> Effect:
         """The effect with bounds narrowed to where a search from these values makes sense."""
@@ -127,39 +107,33 @@ class Effect(Term):
         result[:, cls.main] = anchor + rungs * (values[cls.main] - anchor)
         return result
 
-    @property
-    def neutral(self) -> FloatArray:
-        """(parameters,) values at which the model is exactly the plain one."""
-        return np.array([p.nominal for p in self.parameters])
 
+@dataclass(frozen=True)
+class DofEffect(Effect):
+    """An effect that is a compiled field of a joint's degree of freedom; of several numbers the first.
 
-def scale_at(scales: Scales, place: str) -> JointScale:
-    """Size at a joint; for a body that of the joint it hangs on; for the robot the largest of all."""
-    if place in scales:
-        return scales[place]
-    whole = list(scales.values())
-    return JointScale(
-        torque_rms=max(s.torque_rms for s in whole),
-        torque_peak=max(s.torque_peak for s in whole),
-        velocity_rms=max(s.velocity_rms for s in whole),
-        velocity_peak=max(s.velocity_peak for s in whole),
-        acceleration_rms=max(s.acceleration_rms for s in whole),
-        span=max(s.span for s in whole),
-        measured_rms=max(s.measured_rms for s in whole),
-        measured_peak=max(s.measured_peak for s in whole),
-    )
+    Class attributes
+    ----------------
+    compiled : name of the field.
+    """
 
+    compiled: ClassVar[str] = ""
 
-def middle_scale(scales: Sequence[JointScale]) -> JointScale:
-    """Median size of several joints."""
-    return JointScale(
-        torque_rms=float(np.median([s.torque_rms for s in scales])),
-        torque_peak=float(np.median([s.torque_peak for s in scales])),
-        velocity_rms=float(np.median([s.velocity_rms for s in scales])),
-        velocity_peak=float(np.median([s.velocity_peak for s in scales])),
-        acceleration_rms=float(np.median([s.acceleration_rms for s in scales])),
-        span=float(np.median([s.span for s in scales])),
-        slide=scales[0].slide,
-        measured_rms=float(np.median([s.measured_rms for s in scales])),
-        measured_peak=float(np.median([s.measured_peak for s in scales])),
-    )
+    @classmethod
+    def own_value(cls, model: mujoco.MjModel, place: str) -> float:
+        dof = model.jnt_dofadr[model.joint(place).id]
+        return float(np.ravel(getattr(model, cls.compiled)[dof])[0])
+
+    def held_in(self, model: mujoco.MjModel, place: str) -> tuple[str, int]:
+        """The compiled field that has the number of a place, and its row."""
+        return self.compiled, int(model.jnt_dofadr[model.joint(place).id])
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        fields: Fields = {}
+        for place, name in enumerate(self.places):
+            compiled, row = self.held_in(batch.model, name)
+            field = fields[compiled] if compiled in fields else batch.read(compiled)
+            at = (slice(None), row, 0)[: field.ndim]
+            field[at] = self.changed(field[at], values[:, place, 0])
+            fields[compiled] = field
+        return fields

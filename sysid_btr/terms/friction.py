@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Fields, Kind, Step
-from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.base import LINK_SUFFIX, Kind, Step
+from sysid_btr.terms.effect import DofEffect, Effect, Probe
 from sysid_btr.terms.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True)
-class CoulombFriction(Effect):
+class CoulombFriction(DofEffect):
     """Dry friction: a torque of constant size against the motion; it holds the joint still up to that size.
 
     Native: `dof_frictionloss`.
     """
 
     name: ClassVar[str] = "coulomb_friction"
+    field: ClassVar[str] = "frictionloss"
+    compiled: ClassVar[str] = "dof_frictionloss"
     title: ClassVar[str] = "dry friction"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.05),)
     everywhere: ClassVar[bool] = True
@@ -41,20 +46,28 @@ class CoulombFriction(Effect):
         held = 0.7 * scale.measured_rms  # a joint that sticks most of the time
         return tuple(((t,),) for t in (size, 4 * size, *((held,) if held > 6 * size else ())))
 
-    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        friction = batch.read("dof_frictionloss")
-        friction[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
-        return {"dof_frictionloss": friction}
+
+@dataclass(frozen=True)
+class Damping(DofEffect):
+    """A joint's own damping, which acts on both sides together where another term has split the joint."""
+
+    def held_in(self, model: mujoco.MjModel, place: str) -> tuple[str, int]:
+        for t in range(model.ntendon):
+            if model.tendon(t).name == place + LINK_SUFFIX:
+                return self.compiled.replace("dof_", "tendon_"), t
+        return super().held_in(model, place)
 
 
 @dataclass(frozen=True)
-class ViscousDamping(Effect):
+class ViscousDamping(Damping):
     """Viscous damping: a torque proportional to velocity, against it.
 
     Native: `dof_damping`. The same as the servo's kv where only position is logged.
     """
 
     name: ClassVar[str] = "viscous_damping"
+    field: ClassVar[str] = "damping"
+    compiled: ClassVar[str] = "dof_damping"
     title: ClassVar[str] = "viscous damping"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", 0.0, 0.0, 10.0, 0.05),)
     everywhere: ClassVar[bool] = True
@@ -67,20 +80,17 @@ class ViscousDamping(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         return (Kind("b", scale.unit("Nm s/rad"), 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
 
-    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        damping = batch.read("dof_damping")
-        damping[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
-        return {"dof_damping": damping}
-
 
 @dataclass(frozen=True)
-class QuadraticDamping(Effect):
+class QuadraticDamping(Damping):
     """Quadratic damping: a torque proportional to velocity times speed, against it.
 
     Native: the first term of `dof_dampingpoly`.
     """
 
     name: ClassVar[str] = "quadratic_damping"
+    field: ClassVar[str] = "quadratic_damping"
+    compiled: ClassVar[str] = "dof_dampingpoly"
     title: ClassVar[str] = "quadratic damping"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s2/rad2", 0.0, 0.0, 10.0, 0.05),)
     everywhere: ClassVar[bool] = True
@@ -93,11 +103,6 @@ class QuadraticDamping(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = scale.damping / scale.velocity_rms
         return (Kind("b", scale.unit("Nm s2/rad2"), 0.0, 0.0, 5 * size, 0.1 * size),)
-
-    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        damping = batch.read("dof_dampingpoly")
-        damping[:, batch.index.dof[batch.index.of(self.places)], 0] += values[:, :, 0]
-        return {"dof_dampingpoly": damping}
 
 
 SIZES, SHARES, SPEEDS = (0.6, 1.0, 1.6), (0.2, 0.5, 0.8), (0.4, 1.0, 2.5)

@@ -1,18 +1,17 @@
-"""The parameter grammar: ``FIELD:GLOB[,GLOB...][=shared]`` to terms of a robot."""
+"""The parameter grammar: ``NAME[.KIND]:GLOB[,GLOB...][=shared]`` to terms of a robot."""
 
 from __future__ import annotations
 
 import difflib
 import fnmatch
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 from sysid_btr.errors import UsageError
-from sysid_btr.terms.base import Parameter, Scope
-from sysid_btr.terms.fields import FIELDS, FieldTerm, nominal_value
-from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales
+from sysid_btr.terms.base import Scope, Term, parameter_of
+from sysid_btr.terms.library import declarable
+from sysid_btr.terms.scales import SLIDE_UNITS, Scales, largest_scale
 
 if TYPE_CHECKING:
     import mujoco
@@ -31,23 +30,21 @@ class Robot(Protocol):
     def tied(self) -> tuple[tuple[str, ...], ...]: ...
 
     @property
-    def fields(self) -> Mapping[str, type[FieldTerm]]: ...
+    def fields(self) -> Mapping[str, type[Term]]: ...
 
     def compile(self) -> mujoco.MjModel: ...
 
     def names(self, scope: Scope) -> tuple[str, ...]: ...
 
 
-def parse_parameters(
-    expressions: Sequence[str], robot: Robot, scales: Scales | None = None
-) -> tuple[FieldTerm, ...]:
+def parse_parameters(expressions: Sequence[str], robot: Robot, scales: Scales | None = None) -> tuple[Term, ...]:
     """Terms for the parameters that a user frees.
 
     Parameters
     ----------
-    expressions : such as ``mass:*Knee*,*HipPitch``, ``kp:*=shared``, ``frictionloss:slider``.
+    expressions : such as ``mass:*Knee*,*HipPitch``, ``kp:*=shared``, ``frictionloss:slider``, ``backlash.play:*Knee``.
     robot : names, nominal values, bounds and joints that share a motor.
-    scales : sizes at each joint, for bounds of absolute fields; without them only factors are bounded.
+    scales : sizes at each joint, for bounds; without them bounds are the same for every robot.
 
     Raises
     ------
@@ -55,16 +52,18 @@ def parse_parameters(
         Naming what does not match, and what there is; all problems at once.
     """
     problems: list[str] = []
-    result: list[FieldTerm] = []
-    taken: dict[str, str] = {}
+    result: list[Term] = []
+    taken: dict[tuple[str, str, str], str] = {}
+    table = declarable(robot.fields)
     for expression in expressions:
         try:
-            for term in _parse_one(expression, robot, scales):
+            for term in _parse_one(expression, robot, scales, table):
                 for place in term.places:
-                    key = f"{term.name}:{place}"
-                    if key in taken:
-                        raise UsageError(f"{key} is already declared by {taken[key]!r}")
-                    taken[key] = expression
+                    for kind in term.numbers:
+                        key = (term.name, kind.name, place)
+                        if key in taken:
+                            raise UsageError(f"{term.called}:{place} is already declared by {taken[key]!r}")
+                        taken[key] = expression
                 result.append(term)
         except UsageError as error:
             problems.append(f"  --fit {expression}: {error}")
@@ -73,54 +72,49 @@ def parse_parameters(
     return tuple(result)
 
 
-def _parse_one(expression: str, robot: Robot, scales: Scales | None) -> list[FieldTerm]:
-    field, colon, rest = expression.partition(":")
+def _parse_one(
+    expression: str, robot: Robot, scales: Scales | None, table: Mapping[str, type[Term]]
+) -> list[Term]:
+    label, colon, rest = expression.partition(":")
     if not colon or not rest:
         raise UsageError("expected FIELD:GLOB[,GLOB...][=shared], for example mass:*KneePitch or kp:*=shared")
-    fields = _known_fields(field, robot)
+    bare = _declared(label, table)
     globs, equals, option = rest.partition("=")
     if equals and option != "shared":
         raise UsageError(f"after '=' only 'shared' is allowed, not {option!r}")
-    cls = fields[field]
-    known = robot.names(cls.scope)
+    known = robot.names(bare.location)
     names: list[str] = []
     for glob in globs.split(","):
         matched = [n for n in known if fnmatch.fnmatchcase(n, glob)]
         if not matched:
             raise UsageError(
-                f"{glob!r} matches no {_scope_noun(cls.scope)} of {robot.name}; there are: {', '.join(known)}"
+                f"{glob!r} matches no {_scope_noun(bare.location)} of {robot.name}; there are: {', '.join(known)}"
             )
         names += [n for n in matched if n not in names]
     if option == "shared":
-        return [_build(cls, tuple(names), robot, scales, label=globs)]
-    return [_build(cls, group, robot, scales) for group in _motors(cls.scope, names, robot)]
+        return [_build(bare, tuple(names), robot, scales, globs)]
+    return [_build(bare, group, robot, scales, ",".join(group)) for group in _motors(bare.location, names, robot)]
 
 
-ALSO_CALLED = {
-    "friction": "frictionloss",
-    "coulomb_friction": "frictionloss",
-    "viscous_damping": "damping",
-    "joint_spring": "stiffness",
-    "spring": "stiffness",
-    "torque_limit": "force_limit",
-    "command_delay": "delay",
-    "com_offset": "com",
-    "p": "kp",
-    "d": "kv",
-    "kd": "kv",
-    "gain": "kp",
-}
-"""Names that people try -> fields; some are effects, which `close` looks for by itself."""
+ALSO_CALLED = {"friction": "frictionloss", "spring": "stiffness", "p": "kp", "d": "kv", "kd": "kv", "gain": "kp"}
+"""Names that people try -> fields."""
 
 
-def _known_fields(field: str, robot: Robot) -> dict[str, type[FieldTerm]]:
-    """All fields of a robot, if `field` is one."""
-    fields = {**FIELDS, **robot.fields}
-    if field not in fields:
-        meant = ALSO_CALLED.get(field) or next(iter(difflib.get_close_matches(field, fields, n=1)), None)
+def _declared(label: str, table: Mapping[str, type[Term]]) -> Term:
+    """The term that a name frees, all of its kinds or, after a point, one; at no place yet."""
+    stem, _, last = label.rpartition(".")
+    name = label if label in table or stem not in table else stem
+    if name not in table:
+        meant = ALSO_CALLED.get(name) or next(iter(difflib.get_close_matches(name, table, n=1)), None)
         hint = f" (did you mean {meant!r}?)" if meant else ""
-        raise UsageError(f"unknown field {field!r}{hint}; fields are {', '.join(fields)}")
-    return fields
+        raise UsageError(f"unknown field {name!r}{hint}; fields are {', '.join(table)}")
+    bare = table[name](places=(), declared=name)
+    if name == label:
+        return bare
+    kinds = [k.name for k in bare.numbers]
+    if last not in kinds:
+        raise UsageError(f"{name} has no {last!r}; it has {', '.join(kinds)}")
+    return replace(bare, fixed=tuple(None if k == last else 0.0 for k in kinds)) if len(kinds) > 1 else bare
 
 
 def check_expression(name: str, robot: Robot) -> None:
@@ -132,12 +126,10 @@ def check_expression(name: str, robot: Robot) -> None:
         Saying what is unknown, and what there is.
     """
     label, colon, places = name.partition(":")
-    field, dot, kind = label.partition(".")
-    kinds = [k.name for k in _known_fields(field, robot)[field].kinds]
-    if dot and kind not in kinds:
-        raise UsageError(f"{field} has no {kind!r}; it has {', '.join(kinds)}")
+    table = declarable(robot.fields)
+    _declared(label, table)
     if colon:
-        _parse_one(f"{field}:{places}", robot, None)
+        _parse_one(f"{label}:{places}", robot, None, table)
 
 
 def _scope_noun(scope: Scope) -> str:
@@ -157,52 +149,22 @@ def _motors(scope: Scope, names: list[str], robot: Robot) -> list[tuple[str, ...
     return groups
 
 
-def _build(
-    cls: type[FieldTerm],
-    places: tuple[str, ...],
-    robot: Robot,
-    scales: Scales | None,
-    label: str | None = None,
-) -> FieldTerm:
+def _build(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales | None, label: str) -> Term:
+    """The term at some places, which share its numbers; `label` is what they are called by together."""
+    kinds = bare.kinds if scales is None else bare.sized(largest_scale(scales, places))
+    fixed = tuple(None if v is None else k.nominal for k, v in zip(kinds, bare.fixed, strict=False))
+    term = replace(bare, places=places, shared=len(places) > 1, fixed=fixed)
     model = robot.compile()
-    bare = cls(places=places, shared=len(places) > 1)
+    if term.absolute:
+        kinds = (term.absolute_kind(kinds[0], term.own_value(model, places[0])),)
+    free = [k for k, v in zip(kinds, fixed, strict=True) if v is None] if fixed else kinds
     known = []
-    for parameter in bare.parameters:
-        limits = _limits(parameter, cls.name, places[0], robot, model, scales)
-        if label is not None:
-            limits = replace(limits, name=f"{limits.name.partition(':')[0]}:{label}")
-        known.append(limits)
-    return replace(bare, known=tuple(known))
-
-
-def _limits(
-    parameter: Parameter,
-    field: str,
-    place: str,
-    robot: Robot,
-    model: mujoco.MjModel,
-    scales: Scales | None,
-) -> Parameter:
-    """Nominal, bounds, scale and unit of one parameter at one place."""
-    scale = None if scales is None else scales.get(place)
-    nominal = nominal_value(field, model, place) if math.isnan(parameter.nominal) else parameter.nominal
-    size, reach = parameter.scale, math.inf
-    if field in SIZES and scale is not None:
-        size, reach = SIZES[field](scale)
-    if math.isnan(size):
-        size = 0.1 * abs(nominal) if nominal and math.isfinite(nominal) else 1.0
-    if not math.isfinite(reach):
-        reach = 100 * size
-    lower = parameter.lower if math.isfinite(parameter.lower) else -reach
-    unlimited = not math.isfinite(nominal)
-    upper = parameter.upper
-    if not math.isfinite(upper):
-        upper = reach if unlimited else max(reach, 10 * nominal)
-    if unlimited:
-        nominal = upper
-    lower, upper = _own_bounds(parameter.name, field, place, robot.bounds, (lower, upper))
-    unit = SLIDE_UNITS.get(parameter.unit, parameter.unit) if _slides(model, place) else parameter.unit
-    return Parameter(parameter.name, unit, nominal, lower, upper, size)
+    for parameter, kind in zip(term.parameters, free, strict=True):
+        bounds = _own_bounds(parameter.name, term.called, places[0], robot.bounds, (kind.lower, kind.upper))
+        unit = SLIDE_UNITS.get(kind.unit, kind.unit) if _slides(model, places[0]) else kind.unit
+        named = f"{parameter.name.partition(':')[0]}:{label}"
+        known.append(parameter_of(replace(kind, unit=unit, lower=bounds[0], upper=bounds[1]), named))
+    return replace(term, known=tuple(known))
 
 
 def _slides(model: mujoco.MjModel, place: str) -> bool:
@@ -223,15 +185,3 @@ def _own_bounds(
         if key in table:
             return table[key]
     return default
-
-
-SIZES: dict[str, Callable[[JointScale], tuple[float, float]]] = {
-    "damping": lambda s: (0.1 * s.damping, 5 * s.damping),
-    "quadratic_damping": lambda s: (0.1 * s.damping / s.velocity_rms, 5 * s.damping / s.velocity_rms),
-    "frictionloss": lambda s: (0.1 * s.torque_rms, s.counter_peak),
-    "armature": lambda s: (0.1 * s.inertia, 5 * s.inertia),
-    "stiffness": lambda s: (0.1 * s.torque_rms / s.span, 10 * s.torque_rms / s.span),
-    "force_limit": lambda s: (0.1 * s.torque_peak, 2 * s.torque_peak),
-    "constant_force": lambda s: (0.1 * s.torque_rms, s.counter_peak),
-}
-"""Field -> (size that matters, largest sensible value) at a joint."""

@@ -8,23 +8,77 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.terms.base import BatchModel, Fields, Kind
-from sysid_btr.terms.effect import Effect, Probe
-from sysid_btr.terms.fields import allow_any_inertia
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope
+from sysid_btr.terms.effect import DofEffect, Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
 if TYPE_CHECKING:
     import mujoco
 
 
+def bodies(batch: BatchModel, places: tuple[str, ...]) -> list[int]:
+    """Ids of bodies."""
+    return [batch.model.body(name).id for name in places]
+
+
+def allow_any_inertia(spec: mujoco.MjSpec, places: tuple[str, ...]) -> None:
+    """Tell MuJoCo that these bodies' centres of mass will move: no short cuts for symmetric bodies."""
+    for name in places:
+        spec.body(name).simple = 0
+
+
 @dataclass(frozen=True)
-class Armature(Effect):
+class Mass(Effect):
+    """Mass of a body as a factor of the nominal; the inertia follows."""
+
+    name: ClassVar[str] = "mass"
+    title: ClassVar[str] = "change of the mass"
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("payload", "nothing, where the load sits at the body's centre of mass"),
+    )
+    scope: ClassVar[Scope] = "body"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.3, 3.0, 0.1),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = bodies(batch, self.places)
+        mass, inertia = batch.read("body_mass"), batch.read("body_inertia")
+        mass[:, ids] *= values[:, :, 0]
+        inertia[:, ids] *= values[:, :, :1]
+        return {"body_mass": mass, "body_inertia": inertia}
+
+
+@dataclass(frozen=True)
+class Inertia(Effect):
+    """Rotational inertia of a body about its centre of mass, as a factor; the mass stays."""
+
+    name: ClassVar[str] = "inertia"
+    title: ClassVar[str] = "change of the inertia"
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("armature", "motion of the body about several axes"),
+    )
+    scope: ClassVar[Scope] = "body"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.1, 10.0, 0.2),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        inertia = batch.read("body_inertia")
+        inertia[:, bodies(batch, self.places)] *= values[:, :, :1]
+        return {"body_inertia": inertia}
+
+
+@dataclass(frozen=True)
+class Armature(DofEffect):
     """Rotor inertia seen at the joint through the gear: ratio squared times the rotor's.
 
     Native: `dof_armature`.
     """
 
     name: ClassVar[str] = "armature"
+    field: ClassVar[str] = "armature"
+    compiled: ClassVar[str] = "dof_armature"
     title: ClassVar[str] = "rotor inertia"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("inertia", "kg m2", 0.0, 0.0, 1.0, 0.001),)
     everywhere: ClassVar[bool] = True
@@ -36,11 +90,6 @@ class Armature(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         return (Kind("inertia", scale.unit("kg m2"), 0.0, 0.0, 5 * scale.inertia, 0.05 * scale.inertia),)
-
-    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        armature = batch.read("dof_armature")
-        armature[:, batch.index.dof[batch.index.of(self.places)]] += values[:, :, 0]
-        return {"dof_armature": armature}
 
 
 ARM = 0.05
@@ -156,6 +205,7 @@ class ComOffset(Effect):
     """
 
     name: ClassVar[str] = "com_offset"
+    also: ClassVar[tuple[str, ...]] = ("com",)
     title: ClassVar[str] = "shift of the centre of mass"
     scope: ClassVar = "body"
     signed: ClassVar[bool] = True
@@ -174,9 +224,8 @@ class ComOffset(Effect):
         allow_any_inertia(spec, self.places)
 
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        ids = [batch.model.body(name).id for name in self.places]
         centre = batch.read("body_ipos")
-        centre[:, ids] += values
+        centre[:, bodies(batch, self.places)] += values
         return {"body_ipos": centre}
 
 

@@ -1,11 +1,13 @@
-"""All effects, in the order in which they are tried; add a class here to add an effect."""
+"""All terms, built in or installed by other packages: what can be freed by name, and what `close` looks for."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from sysid_btr.errors import UsageError
+from sysid_btr.plugins import installed, load_installed
+from sysid_btr.terms.base import Term
 from sysid_btr.terms.contact import FootCompliance, FootFriction
 from sysid_btr.terms.disturbance import (
     ConstantForce,
@@ -24,15 +26,24 @@ from sysid_btr.terms.friction import (
     StribeckFriction,
     ViscousDamping,
 )
-from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
+from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Inertia, Mass, Payload
+from sysid_btr.terms.initial_state import StartPosition, StartVelocity
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
 from sysid_btr.terms.sensing import EncoderOffset, EncoderOffsetInLoop, EncoderScale, EncoderScaleInLoop, SensorDelay
-from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain
+from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain, Kp, Kv, TorqueConstant
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
-EFFECTS: tuple[type[Effect], ...] = (
+ENTRY_POINTS = "sysid_btr.terms"
+"""Entry-point group; each entry is a class of terms, under its name."""
+
+BUILT_IN: tuple[type[Term], ...] = (
+    Mass,
+    Inertia,
+    Kp,
+    Kv,
+    TorqueConstant,
     CoulombFriction,
     ViscousDamping,
     QuadraticDamping,
@@ -71,31 +82,71 @@ EFFECTS: tuple[type[Effect], ...] = (
     GravityTilt,
     FootFriction,
     FootCompliance,
+    StartPosition,
+    StartVelocity,
 )
+"""In the order in which they are tried."""
+
+
+def all_terms() -> tuple[type[Term], ...]:
+    """Every term, the installed ones last.
+
+    Raises
+    ------
+    UsageError
+        If one is installed but cannot be loaded, or is not a term.
+    """
+    more: list[type[Term]] = []
+    for name in sorted(installed(ENTRY_POINTS)):
+        found = load_installed(ENTRY_POINTS, name, "term")
+        if not (isinstance(found, type) and issubclass(found, Term)):
+            raise UsageError(f"term {name!r} is installed but is not a class derived from Term: {found!r}")
+        more.append(found)
+    return (*BUILT_IN, *more)
+
+
+def declarable(more: Mapping[str, type[Term]]) -> dict[str, type[Term]]:
+    """Terms by the names under which they can be freed: of the model's own value, of the term, of its variant.
+
+    `more` are those that one robot alone has.
+    """
+    terms = all_terms()
+    table = {cls.field: cls for cls in terms if cls.field}
+    for cls in terms:
+        for name in (cls.name, *cls.also, *([f"{cls.name}.{cls.variant}"] if cls.variant else [])):
+            table.setdefault(name, cls)
+    return {**table, **more}
+
+
+def effects() -> tuple[type[Effect], ...]:
+    """All effects that a model may lack."""
+    return tuple(cls for cls in all_terms() if issubclass(cls, Effect))
 
 
 def effect_names() -> tuple[str, ...]:
     """Names of all effects, each once."""
-    return tuple(dict.fromkeys(e.name for e in EFFECTS))
+    return tuple(dict.fromkeys(e.name for e in effects()))
 
 
 def select_effects(names: Sequence[str]) -> tuple[type[Effect], ...]:
-    """Effects by name; ``all`` for all.
+    """Effects by name, also by the one of the model's own value; ``all`` for the usual ones.
 
     Raises
     ------
     UsageError
         Naming what is unknown, and what there is.
     """
-    known = effect_names()
+    there = effects()
     if "all" in names:
-        return EFFECTS
-    unknown = [n for n in names if n not in known]
+        return tuple(e for e in there if e.usual or e.name in names)
+    called = {other: e.name for e in there for other in (e.name, *e.also, *([e.field] if e.field else []))}
+    unknown = [n for n in names if n not in called]
     if unknown:
-        hints = [difflib.get_close_matches(n, known, n=1) for n in unknown]
+        hints = [difflib.get_close_matches(n, called, n=1) for n in unknown]
         listed = ", ".join(
             f"{n!r}" + (f" (did you mean {h[0]!r}?)" if h else "")
             for n, h in zip(unknown, hints, strict=True)
         )
-        raise UsageError(f"unknown effect {listed}; effects are {', '.join(known)}, or all")
-    return tuple(e for e in EFFECTS if e.name in names)
+        raise UsageError(f"unknown effect {listed}; effects are {', '.join(effect_names())}, or all")
+    wanted = {called[n] for n in names}
+    return tuple(e for e in there if e.name in wanted)

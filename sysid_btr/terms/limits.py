@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import BatchModel, Fields, Kind, Step
 from sysid_btr.terms.effect import Effect, Probe
-from sysid_btr.terms.fields import narrow_force_limit
 from sysid_btr.terms.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True)
 class TorqueLimit(Effect):
     """A servo that cannot give more than a certain torque.
 
-    Native: `actuator_forcerange`. Neutral at the upper bound.
+    Native: `actuator_forcerange`. Neutral at the upper bound. A further limit stays within the model's own; as the
+    model's own, of both signs, it takes that one's place.
     """
 
     name: ClassVar[str] = "torque_limit"
+    field: ClassVar[str] = "force_limit"
     title: ClassVar[str] = "limit of the torque"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("limit", "Nm", 100.0, 0.01, 100.0, 0.1),)
@@ -40,9 +44,26 @@ class TorqueLimit(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return tuple(((f * max(scale.torque_peak, 1e-9),),) for f in (0.85, 0.65, 0.45, 0.28))
 
+    @classmethod
+    def own_value(cls, model: mujoco.MjModel, place: str) -> float:
+        joint = model.joint(place).id
+        for a in range(model.nu):
+            if model.actuator_trnid[a, 0] == joint and model.actuator_forcelimited[a]:
+                return float(model.actuator_forcerange[a, 1] * abs(model.actuator_gear[a, 0]))
+        return float("inf")
+
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        most = np.array([p.upper for p in self.spread_parameters(0)])
-        return narrow_force_limit(batch, self.places, np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0]))
+        ids = batch.index.actuator[batch.index.of(self.places)]
+        limited, ranges = batch.read("actuator_forcelimited"), batch.read("actuator_forcerange")
+        bound = values[:, :, 0] / np.abs(batch.model.actuator_gear[ids, 0])
+        was, low, high = limited[:, ids].astype(bool), ranges[:, ids, 0], ranges[:, ids, 1]
+        inside = was & (not self.absolute)
+        on = values[:, :, 0] < np.array([p.upper for p in self.spread_parameters(0)])
+        on |= was & self.absolute
+        ranges[:, ids, 0] = np.where(on, np.where(inside, np.maximum(-bound, low), -bound), low)
+        ranges[:, ids, 1] = np.where(on, np.where(inside, np.minimum(bound, high), bound), high)
+        limited[:, ids] = was | on
+        return {"actuator_forcelimited": limited, "actuator_forcerange": ranges}
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -62,3 +65,25 @@ SLIDE_UNITS = {
     "rad/s": "m/s",
     "rad/Nm": "m/N",
 }
+
+
+def scale_at(scales: Scales, place: str) -> JointScale:
+    """Size at a joint; for a body that of the joint it hangs on; for the robot the largest of all."""
+    if place in scales:
+        return scales[place]
+    return _combined(list(scales.values()), max, slide=False)
+
+
+def largest_scale(scales: Scales, places: Sequence[str]) -> JointScale:
+    """Size at the one of several places that has the largest torques."""
+    return max((scale_at(scales, p) for p in places), key=lambda s: s.torque_peak)
+
+
+def middle_scale(scales: Sequence[JointScale]) -> JointScale:
+    """Median size of several joints."""
+    return _combined(scales, np.median, slide=scales[0].slide)
+
+
+def _combined(scales: Sequence[JointScale], how: Callable[[list[float]], Any], *, slide: bool) -> JointScale:
+    names = [f.name for f in fields(JointScale) if f.name != "slide"]
+    return JointScale(slide=slide, **{name: float(how([getattr(s, name) for s in scales])) for name in names})

@@ -8,10 +8,82 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Step
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope, Step
 from sysid_btr.terms.effect import Effect, Probe
-from sysid_btr.terms.fields import delay_command
 from sysid_btr.terms.scales import JointScale
+
+
+def servos(batch: BatchModel, places: tuple[str, ...]) -> IntArray:
+    """Actuators of some joints."""
+    result: IntArray = batch.index.actuator[batch.index.of(places)]
+    return result
+
+
+@dataclass(frozen=True)
+class Kp(Effect):
+    """Proportional gain of a position servo, as a factor."""
+
+    name: ClassVar[str] = "kp"
+    title: ClassVar[str] = "change of the servo's stiffness"
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("torque_constant", "a logged effort or current"),
+        ("joint_compliance", "a logged effort, or fast motion"),
+    )
+    scope: ClassVar[Scope] = "servo"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 3.0, 0.05),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = servos(batch, self.places)
+        gain, bias = batch.read("actuator_gainprm"), batch.read("actuator_biasprm")
+        gain[:, ids, 0] *= values[:, :, 0]
+        bias[:, ids, 1] *= values[:, :, 0]
+        return {"actuator_gainprm": gain, "actuator_biasprm": bias}
+
+
+@dataclass(frozen=True)
+class Kv(Effect):
+    """Derivative gain of a position servo, as a factor."""
+
+    name: ClassVar[str] = "kv"
+    title: ClassVar[str] = "change of the servo's damping"
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("viscous_damping", "a logged effort or current; position alone cannot tell the two apart"),
+    )
+    scope: ClassVar[Scope] = "servo"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.0, 5.0, 0.1),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        bias = batch.read("actuator_biasprm")
+        bias[:, servos(batch, self.places), 2] *= values[:, :, 0]
+        return {"actuator_biasprm": bias}
+
+
+@dataclass(frozen=True)
+class TorqueConstant(Effect):
+    """Torque that a servo makes, its gains and its limits alike, as a factor: motor constant over resistance."""
+
+    name: ClassVar[str] = "torque_constant"
+    title: ClassVar[str] = "change of the servo's torque"
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("kp", "motion in which the drive saturates"),
+        ("mass", "motion of several loads"),
+    )
+    scope: ClassVar[Scope] = "servo"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 3.0, 0.05),)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids = servos(batch, self.places)
+        gain, bias, limits = (batch.read(f"actuator_{name}") for name in ("gainprm", "biasprm", "forcerange"))
+        gain[:, ids, 0] *= values[:, :, 0]
+        bias[:, ids, :3] *= values[:, :, :1]
+        limits[:, ids] *= values[:, :, :1]
+        return {"actuator_gainprm": gain, "actuator_biasprm": bias, "actuator_forcerange": limits}
 
 
 @dataclass(frozen=True)
@@ -91,6 +163,7 @@ class CommandDelay(Effect):
     """
 
     name: ClassVar[str] = "command_delay"
+    also: ClassVar[tuple[str, ...]] = ("delay",)
     title: ClassVar[str] = "delay of the command"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.15, 0.004),)
@@ -106,3 +179,23 @@ class CommandDelay(Effect):
 
     def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         return delay_command(command, batch.index.of(self.places), values[:, :, 0] / batch.timestep)
+
+
+def delay_command(command: FloatArray, columns: IntArray, steps: FloatArray) -> FloatArray:
+    """Shift held commands by a possibly fractional number of steps, (m, places); the past is the first one.
+
+    Between whole steps the mean over the step is mixed, which is exact for a held command.
+    """
+    shifted = np.array(np.broadcast_to(command, (len(steps), *command.shape[1:])))
+    rows = np.arange(command.shape[1])
+    for place, column in enumerate(columns):
+        whole = np.floor(steps[:, place]).astype(np.int64)
+        part = (steps[:, place] - whole)[:, None]
+        late = np.maximum(rows[None, :] - whole[:, None], 0)
+        later = np.maximum(late - 1, 0)
+        later[rows[None, :] - whole[:, None] <= 0] = 0
+        source = np.broadcast_to(command[:, :, column], (len(steps), command.shape[1]))
+        near = np.take_along_axis(source, late, axis=1)
+        far = np.take_along_axis(source, later, axis=1)
+        shifted[:, :, column] = (1 - part) * near + part * far
+    return shifted

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -12,15 +12,20 @@ from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
+if TYPE_CHECKING:
+    import mujoco
+
 
 @dataclass(frozen=True)
 class JointSpring(Effect):
     """A spring across a joint: a cable, a rubber stop, gravity compensation.
 
-    Native: `jnt_stiffness` and `qpos_spring`; stiffness zero is the plain model at any rest angle.
+    Native: `jnt_stiffness` and `qpos_spring`; stiffness zero is the plain model at any rest angle. As the model's own
+    stiffness it keeps the model's own rest angle.
     """
 
     name: ClassVar[str] = "joint_spring"
+    field: ClassVar[str] = "stiffness"
     title: ClassVar[str] = "spring across the joint"
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (
@@ -57,13 +62,18 @@ class JointSpring(Effect):
         values[0] *= total
         return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
 
+    @classmethod
+    def own_value(cls, model: mujoco.MjModel, place: str) -> float:
+        return float(model.jnt_stiffness[model.joint(place).id])
+
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
         ids = [batch.model.joint(name).id for name in self.places]
         qpos = batch.model.jnt_qposadr[ids]
         stiffness, rest = batch.read("jnt_stiffness"), batch.read("qpos_spring")
         before = stiffness[:, ids].copy()
-        total = before + values[:, :, 0]
+        stiffness[:, ids] = total = self.changed(before, values[:, :, 0])
+        if self.absolute:
+            return {"jnt_stiffness": stiffness}
         moment = before * rest[:, qpos] + values[:, :, 0] * values[:, :, 1]
         rest[:, qpos] = np.where(total > 0, moment / np.where(total > 0, total, 1.0), rest[:, qpos])
-        stiffness[:, ids] = total
         return {"jnt_stiffness": stiffness, "qpos_spring": rest}

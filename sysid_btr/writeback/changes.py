@@ -65,7 +65,7 @@ class Stated:
     def of(self, place: str) -> tuple[Estimate, ...]:
         """Estimates at a place."""
         term = self.part.term
-        kinds = len(term.kinds)
+        kinds = len(term.numbers)
         if not self.estimates or not kinds:
             return ()
         group = 0 if len(term.groups) == 1 else term.places.index(place)
@@ -115,7 +115,7 @@ def _of_kind(kind: Kind, before: mujoco.MjModel, after: mujoco.MjModel, stated: 
             by = [s for s in stated if s.acts_at(place) and s.fields & set(feature.fields)]
             by = by or [s for s in stated if s.acts_at(place) and s.structural and kind != "option"]
             for attribute, old, new in _values(feature, before, i, after, j):
-                called = [s for s in by if s.part.term.name == attribute]
+                called = [s for s in by if s.part.term.called == attribute]
                 yield _change(kind, name, place, attribute, old, new, called or by, set(feature.fields))
 
 
@@ -176,7 +176,7 @@ def _size(values: FloatArray) -> int:
 
 
 def _added(kind: Kind, name: str, place: str, by: Sequence[Stated]) -> Change:
-    names = tuple(s.part.term.name for s in by)
+    names = tuple(s.part.term.called for s in by)
     why = "; ".join(describe(s.part, place) for s in by)
     return Change(kind, name, "", "", "", names, "", f"{kind} {name} added" + (f": {why}" if why else ""))
 
@@ -197,7 +197,7 @@ def _change(
     tail = _stands_for(others[0].part, place) if others else _certainty(known, before, after)
     what = " ".join(part for part in (kind, name, attribute) if part)
     line = f"{what} {_text(before)} -> {_text(after)}{tail}"
-    return Change(kind, name, attribute, before, after, tuple(s.part.term.name for s in by), tail, line)
+    return Change(kind, name, attribute, before, after, tuple(s.part.term.called for s in by), tail, line)
 
 
 def _stands_for(part: Part, place: str) -> str:
@@ -239,8 +239,8 @@ def describe(part: Part, place: str | None = None) -> str:
 
 def called(part: Part) -> str:
     """Name of a term, with its variant."""
-    variant = getattr(part.term, "variant", "")
-    return f"{part.term.name} ({variant})" if variant else part.term.name
+    variant = part.term.variant
+    return f"{part.term.called} ({variant})" if variant else part.term.called
 
 
 def amounts(part: Part, place: str) -> str:
@@ -249,8 +249,9 @@ def amounts(part: Part, place: str) -> str:
     if not term.kinds:
         return ""
     row = part.values[0, term.places.index(place)]
-    units = [p.unit for p in term.parameters[: len(term.kinds)]]
+    units = {k.name: p.unit for k, p in zip(term.numbers, term.parameters, strict=False)}
     return ", ".join(
         f"{kind.name} {value:.6g}" + ("" if unit == "1" else f" {unit}")
-        for kind, value, unit in zip(term.kinds, row, units, strict=True)
+        for kind, value in zip(term.kinds, row, strict=False)
+        for unit in (units.get(kind.name, kind.unit),)
     )

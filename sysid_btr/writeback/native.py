@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from sysid_btr._typing import FloatArray
 from sysid_btr.terms.base import BatchModel, Fields, Term
 from sysid_btr.terms.disturbance import ConstantForce
-from sysid_btr.terms.fields import ConstantForce as ConstantForceField
-from sysid_btr.terms.fields import Delay
 from sysid_btr.terms.inertial import Payload
 from sysid_btr.terms.sensing import EncoderOffsetInLoop
 from sysid_btr.terms.servo import CommandDelay
@@ -105,13 +103,10 @@ class AddedBody(Term):
 
 
 def _payload(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
-    if any(set(term.places) & set(m.places) and m.name in BODY_FIELDS for m in later):
+    if any(set(term.places) & set(m.places) and m.scope == "body" for m in later):
         return None  # what follows changes body and load together
     loads = tuple(tuple(float(x) for x in row) for row in values)
     return AddedBody(places=term.places, loads=loads), "yes", "a body of its own"
-
-
-BODY_FIELDS = ("mass", "com", "inertia", "com_offset", "payload")
 
 
 @dataclass(frozen=True)
@@ -196,7 +191,7 @@ class SoftSpring(Term):
 
 
 def _constant(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
-    if any(m.name in ("stiffness", "joint_spring") for m in later):
+    if any(m.name == "joint_spring" for m in later):
         return None
     torques = tuple(float(t) for t in values[:, 0])
     how = "a spring on the joint, so soft and so long that its torque is constant"
@@ -234,9 +229,7 @@ Native = Callable[["Term", FloatArray, "Numerics", "tuple[Term, ...]"], Found]
 NATIVE: Mapping[type[Term], Native] = {
     Payload: _payload,
     CommandDelay: _delay,
-    Delay: _delay,
     ConstantForce: _constant,
-    ConstantForceField: _constant,
     EncoderOffsetInLoop: _reference,
 }
 """Terms for which MuJoCo has an element of its own, though the replay goes another way."""

@@ -82,25 +82,26 @@ def read_params(path: Path, robot: Robot) -> Params:
 def _term(
     entry: Mapping[str, Any], places: Mapping[str, Sequence[str]], problems: list[str], robot: Robot
 ) -> Term | None:
-    from sysid_btr.terms.fields import FIELDS
-    from sysid_btr.terms.library import EFFECTS
+    from sysid_btr.terms.library import all_terms, declarable
 
     name, variant, where = str(entry["name"]), str(entry["variant"]), tuple(entry["where"])
-    if entry["kind"] == "parameter":
-        found: Any = {**FIELDS, **robot.fields}.get(name)
+    declared = name if entry["kind"] == "parameter" else ""
+    if declared:
+        found = declarable(robot.fields).get(name)
     else:
-        found = next((e for e in EFFECTS if (e.name, e.variant) == (name, variant)), None)
+        found = next((t for t in all_terms() if (t.name, t.variant) == (name, variant)), None)
     if found is None:
         problems.append(f"this version has no {entry['kind']} {name} {variant}".rstrip())
         return None
-    unknown = [p for p in where if p not in places[found.scope]]
+    fixed = tuple(None if v is None else float(v) for v in entry.get("fixed", ()))
+    bare = found(places=where, shared=bool(entry["shared"]), declared=declared, fixed=fixed)
+    unknown = [p for p in where if p not in places[bare.location]]
     if unknown:
-        problems.append(f"{name}: the model has no {found.scope} {', '.join(unknown)}")
+        problems.append(f"{name}: the model has no {bare.location} {', '.join(unknown)}")
         return None
     known = tuple(_parameter(p) for p in entry["parameters"])
-    bare: Term = found(places=where, shared=bool(entry["shared"]))
     if len(known) != len(bare.parameters):
-        kinds = ", ".join(k.name for k in bare.kinds)
+        kinds = ", ".join(k.name for k in bare.numbers)
         problems.append(
             f"{name} at {', '.join(where)}: {len(known)} numbers, where this version has {len(bare.parameters)} "
             f"({kinds} each); the file is of another version: identify again with this one"

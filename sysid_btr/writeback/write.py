@@ -18,7 +18,6 @@ from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.result import clean, to_json
 from sysid_btr.run_folder import MODEL, PARAMS, Folder
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
 from sysid_btr.version import __version__
 from sysid_btr.writeback.changes import SOLVER, Change, changes_of, describe
@@ -86,7 +85,7 @@ def identified(outcome: Fit | Closing) -> Identified:
     held_back = tuple(
         e.name
         for term in model.terms
-        if not isinstance(term, Effect)
+        if term.declared
         for e, v in zip(estimates[model.terms.columns(term)], model.own(term), strict=True)
         if e.identifiable == "no" and v != e.nominal
     )
@@ -177,11 +176,11 @@ def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], 
     """Comments before what effects change or add; a declared parameter needs none where it has its own name."""
     notes: dict[tuple[Kind, str], str] = {}
     for part in target.parts:
-        if part.stand_in is None or (part.stand_in is part.term and not isinstance(part.term, Effect)):
+        if part.stand_in is None or (part.stand_in is part.term and (part.term.declared or not part.term.kinds)):
             continue
         for change in changes:
             key: tuple[Kind, str] = (change.kind, change.name)  # type: ignore[assignment]
-            if part.term.name not in change.by or change.attribute in SOLVER or change.kind == "geom":
+            if part.term.called not in change.by or change.attribute in SOLVER or change.kind == "geom":
                 continue
             place = change.name.removesuffix("__link").removeprefix("payload_")
             words = describe(part, place)
@@ -300,11 +299,12 @@ def params_of(model: Identified) -> dict[str, Any]:
         known = model.estimates_of(term) or (None,) * len(own)
         entries.append(
             {
-                "kind": "effect" if isinstance(term, Effect) else "parameter",
-                "name": term.name,
-                "variant": getattr(term, "variant", ""),
+                "kind": "parameter" if term.declared else "effect",
+                "name": term.called,
+                "variant": term.variant,
                 "where": term.places,
                 "shared": term.shared,
+                **({"fixed": term.fixed} if term.fixed else {}),
                 "in_file": held.get(id(term), "yes"),
                 "parameters": [
                     {
@@ -340,8 +340,8 @@ def file_losses(model: Identified, path: Path) -> tuple[Losses, bool]:
 def _missing(part: Part, model: Identified) -> dict[str, Any]:
     """What is not in the file, and the loss with it alone left out."""
     entry: dict[str, Any] = {
-        "name": part.term.name,
-        "variant": getattr(part.term, "variant", ""),
+        "name": part.term.called,
+        "variant": part.term.variant,
         "where": list(part.term.places),
         "held": part.held,
         "how": part.how,
