@@ -101,6 +101,7 @@ class Run:
             self.logs,
             holdout=read_holdout(self.options.holdout),
             channels=self.options.channels or FITTED,
+            simulator=self.options.simulator,
             threads=self.options.threads,
             executor=executor,
         )

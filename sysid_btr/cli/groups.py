@@ -118,6 +118,19 @@ class ThreadOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SimulatorOptions(RunOptions):
+    """What moves the model."""
+
+    simulator: str | None = option(
+        None,
+        "Simulator that moves the model: mujoco, or an installed one.",
+        otherwise="mujoco; replay: that of --params",
+        metavar="NAME",
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SeedOptions(RunOptions):
     """What a search uses."""
 
@@ -172,7 +185,16 @@ class RenderOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FittingOptions(StudyOptions, SeedOptions, ThreadOptions, ExecutorOptions, OutOptions, RenderOptions, JsonOptions):
+class FittingOptions(
+    StudyOptions,
+    SimulatorOptions,
+    SeedOptions,
+    ThreadOptions,
+    ExecutorOptions,
+    OutOptions,
+    RenderOptions,
+    JsonOptions,
+):
     """What `fit`, `posterior` and `close` have in common."""
 
 

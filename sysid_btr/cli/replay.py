@@ -10,7 +10,14 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sysid_btr.cli.groups import JsonOptions, LogOptions, ModelOptions, ParamsOptions, ThreadOptions
+from sysid_btr.cli.groups import (
+    JsonOptions,
+    LogOptions,
+    ModelOptions,
+    ParamsOptions,
+    SimulatorOptions,
+    ThreadOptions,
+)
 from sysid_btr.cli.inputs import find_robot, read_logs
 from sysid_btr.cli.kinds import Numbers
 from sysid_btr.cli.options import option
@@ -25,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayOptions(ModelOptions, LogOptions, ParamsOptions, ThreadOptions, JsonOptions):
+class ReplayOptions(ModelOptions, LogOptions, ParamsOptions, SimulatorOptions, ThreadOptions, JsonOptions):
     """Options of `replay`."""
 
     set: Numbers = option(
@@ -93,7 +100,15 @@ def _compare(
     from sysid_btr.objectives.targets import COMPARED
 
     threads = options.threads
-    study = make_study(robot, logs, holdout=logs, channels=COMPARED, numerics=numerics, threads=threads)
+    study = make_study(
+        robot,
+        logs,
+        holdout=logs,
+        channels=COMPARED,
+        numerics=numerics,
+        simulator=options.simulator,
+        threads=threads,
+    )
     scores = score_problem(study.train_problem(model), model.values)
     for path, one in zip(targets, logs, strict=False):
         predicted = replay_log(robot, one, model, numerics=study.numerics, threads=threads)
@@ -128,7 +143,9 @@ def _rehearse(
         raise UsageError("--log: give either excitation trajectories or recordings, not both")
     found = {}
     for path, one in zip_longest(targets, motions):
-        predicted = replay_log(robot, one, model, numerics=numerics, threads=options.threads)
+        predicted = replay_log(
+            robot, one, model, numerics=numerics, simulator=options.simulator, threads=options.threads
+        )
         found[str(one.path)] = reach(robot, one, predicted)
         if path is not None:
             write_log(predicted, path, overwrite=options.overwrite)

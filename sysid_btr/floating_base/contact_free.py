@@ -27,7 +27,6 @@ from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid, make_grid
-from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
 from sysid_btr.simulation.silence import silenced
 
@@ -376,7 +375,8 @@ def _derive(chain: _Chain, values: FloatArray) -> _Derivatives:
 
 def _coarse(steps: SampleSteps) -> SampleSteps:
     period = float(steps.log.time[1] - steps.log.time[0])
-    return replace(steps, numerics=Numerics("RK4", period / int(np.ceil(period / COARSE - 1e-9))))
+    step = period / int(np.ceil(period / COARSE - 1e-9))
+    return replace(steps, numerics=replace(steps.numerics, integrator="RK4", timestep=step))
 
 
 def _blows(chain: _Chain, values: FloatArray) -> FloatArray:

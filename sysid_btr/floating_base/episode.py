@@ -32,7 +32,7 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.marginal import Marginal
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
-from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import Windows
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Terms
@@ -59,7 +59,8 @@ class FloatingProcedure(Procedure):
     no_torque: ClassVar[str] = "its base was floating, and segments are too short"
 
     def coarse(self, numerics: Numerics) -> Numerics:
-        return Numerics("implicitfast", min(numerics.timestep, FASTEST))
+        step = min(numerics.timestep, FASTEST)
+        return replace(numerics, integrator="implicitfast", timestep=step, servo_period=None)
 
     def cheap(self, numerics: Numerics) -> Numerics:
         return self.coarse(numerics)
@@ -175,8 +176,8 @@ class FloatingEpisode(Episode):
         segments = segment_log(self.log, self.base, segment_seconds(self.segments, self.log), late=0.5)
         return replace(self, segments=segments, marginal=None)
 
-    def choose_numerics(self, threads: int = 0) -> tuple[Numerics, float]:
-        return segment_numerics(self.robot, self.log, self.segments, threads)
+    def choose_numerics(self, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
+        return segment_numerics(self.robot, self.log, self.segments, threads, simulator)
 
     def facts(self) -> Mapping[str, Any]:
         weight = np.ones(0) if self.marginal is None else self.marginal.weight

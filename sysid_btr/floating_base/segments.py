@@ -17,7 +17,7 @@ from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import make_targets
-from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import WindowReplay, Windows
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.grammar import parse_parameters
@@ -134,7 +134,9 @@ def covered(segments: Windows, samples: int) -> BoolArray:
     return result
 
 
-def segment_numerics(robot: Robot, log: Log, segments: Windows, threads: int = 0) -> tuple[Numerics, float]:
+def segment_numerics(
+    robot: Robot, log: Log, segments: Windows, threads: int = 0, simulator: str = MUJOCO
+) -> tuple[Numerics, float]:
     """Integrator and step for a log of a floating base, and the change in noise floors when the step is halved.
 
     Fourth-order Runge-Kutta, which leaves gains unbiased between impacts. Impacts limit the order of every
@@ -142,7 +144,7 @@ def segment_numerics(robot: Robot, log: Log, segments: Windows, threads: int = 0
     halved once at most.
     """
     step = float(np.median(np.diff(log.time)))
-    numerics = Numerics("RK4", step / max(int(np.ceil(step / FASTEST - 1e-9)), 1))
+    numerics = Numerics("RK4", step / max(int(np.ceil(step / FASTEST - 1e-9)), 1), simulator=simulator)
     few = segments.chosen(np.arange(0, len(segments), max(len(segments) // 16, 1)))
     error = np.inf
     for _ in range(2):

@@ -41,7 +41,7 @@ def realise_servo(study: Study, model: Model) -> Study:
     """
     if study.numerics.integrator != "Euler":
         return study
-    held = held_numerics(study.robot, study.train[0].log, study.threads)
+    held = held_numerics(study.robot, study.train[0].log, study.threads, study.numerics.simulator)
     if held is None:
         return study
     short = shorten(study, SERVO_SECONDS)

@@ -26,7 +26,7 @@ from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target, make_targets
-from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Terms
@@ -225,9 +225,9 @@ class Episode(ABC):
         """The same with segments that begin half a segment later, if it has any."""
         return self
 
-    def choose_numerics(self, threads: int = 0) -> tuple[Numerics, float]:
+    def choose_numerics(self, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
         """Integrator and step to begin with, and the change in noise floors when the step is halved."""
-        return choose_numerics(self.robot, self.log, threads)
+        return choose_numerics(self.robot, self.log, threads, simulator)
 
     def facts(self) -> Mapping[str, Any] | None:
         """What a result says about how it was segmented, and what its base state lacks; None where it is not."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.noise import noise_floor
-from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.replay import Replay
 
 if TYPE_CHECKING:
@@ -29,7 +30,9 @@ is followed by a check of the fitted parameters themselves (`identify.check_nume
 CHECK_SECONDS = 12.0
 
 
-def choose_numerics(robot: Robot, log: Log, threads: int = 0) -> tuple[Numerics, float]:
+def choose_numerics(
+    robot: Robot, log: Log, threads: int = 0, simulator: str = MUJOCO
+) -> tuple[Numerics, float]:
     """Integrator and step for a log, and the change in noise floors when the step is halved.
 
     A log that states its servo's period is replayed by one explicit Euler step a period, which is how a servo
@@ -44,25 +47,25 @@ def choose_numerics(robot: Robot, log: Log, threads: int = 0) -> tuple[Numerics,
     """
     part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
     if log.meta.servo_period:
-        return Numerics("Euler", float(log.meta.servo_period)), float("nan")
+        return Numerics("Euler", float(log.meta.servo_period), simulator=simulator), float("nan")
     sample = float(np.median(np.diff(log.time)))
-    step = _divisor(sample, COARSEST)
-    now = _positions(robot, part, Numerics("RK4", step), threads)
+    chosen = Numerics("RK4", _divisor(sample, COARSEST), simulator=simulator)
+    now = _positions(robot, part, chosen, threads)
     while True:
-        half = _positions(robot, part, Numerics("RK4", step / 2), threads)
-        error = _change(part, now, half)
-        if error <= TOLERATED or (step / 2 < FINEST and np.isfinite(error)):
-            return Numerics("RK4", step), error
-        if step / 2 < FINEST:
+        half = _positions(robot, part, chosen.halved(), threads)
+        error, finest = _change(part, now, half), chosen.timestep / 2 < FINEST
+        if error <= TOLERATED or (finest and np.isfinite(error)):
+            return chosen, error
+        if finest:
             raise ModelError(
                 f"model {robot.name}: the replay of {log.path or 'the log'} diverges even with a step of "
-                f"{1e3 * step:g} ms. Check gains, armature and masses of the model: a servo far too stiff "
+                f"{1e3 * chosen.timestep:g} ms. Check gains, armature and masses of the model: a servo far too stiff "
                 "for its inertia, or a body without mass, is the usual cause."
             )
-        step, now = step / 2, half
+        chosen, now = chosen.halved(), half
 
 
-def held_numerics(robot: Robot, log: Log, threads: int = 0) -> Numerics | None:
+def held_numerics(robot: Robot, log: Log, threads: int = 0, simulator: str = MUJOCO) -> Numerics | None:
     """Runge-Kutta steps under a servo torque that is held for the log's servo period.
 
     Exact for a servo that knows its velocity. None where the log states no period, or where an explicit
@@ -72,9 +75,10 @@ def held_numerics(robot: Robot, log: Log, threads: int = 0) -> Numerics | None:
         return None
     period = float(log.meta.servo_period)
     part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
-    held = Numerics("RK4", period, period)
+    held = Numerics("RK4", period, period, simulator)
     now = _positions(robot, part, held, threads)
-    if _change(part, _positions(robot, part, Numerics("Euler", period), threads), now) <= TOLERATED:
+    euler = replace(held, integrator="Euler", servo_period=None)
+    if _change(part, _positions(robot, part, euler, threads), now) <= TOLERATED:
         return None
     while True:
         half = _positions(robot, part, held.halved(), threads)

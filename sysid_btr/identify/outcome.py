@@ -10,6 +10,7 @@ from sysid_btr.identify.scores import ChannelScore, channel_entries
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
 from sysid_btr.result import SCHEMA, clean, versions
+from sysid_btr.simulation.numerics import MUJOCO
 from sysid_btr.units import si_all
 
 
@@ -60,7 +61,7 @@ def replay_result(
 
 
 def _provenance(study: Study) -> dict[str, Any]:
-    walks = _walks(study)
+    walks, simulator = _walks(study), study.numerics.simulator
     return {
         "units": channel_units(study.robot),
         "numerics": {
@@ -68,6 +69,7 @@ def _provenance(study: Study) -> dict[str, Any]:
             "timestep": study.numerics.timestep,
             "error_in_noise_floors": study.numerics_error,
             "chosen": str(study.numerics),
+            **({} if simulator == MUJOCO else {"simulator": simulator}),
         },
         "channels": study.channels,
         **({"walks": walks} if walks else {}),

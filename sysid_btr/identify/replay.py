@@ -11,7 +11,8 @@ import numpy as np
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.split import split_episodes
-from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.numerics import MUJOCO, Numerics
+from sysid_btr.simulation.registry import on_simulator
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Model
@@ -28,6 +29,7 @@ def replay_log(
     parameters: Mapping[str, float] | Model | None = None,
     *,
     numerics: Numerics | None = None,
+    simulator: str | None = None,
     threads: int = 0,
 ) -> Log:
     """Give the log's commands to the model, and record its sensors at the log's own times.
@@ -39,6 +41,7 @@ def replay_log(
     parameters : expression of the grammar -> value, for example ``{"mass:*Knee*": 1.1, "kp:*": 0.9}``; or
         a model.
     numerics : integrator and step; None chooses by a convergence check on the log.
+    simulator : what moves the model, by name; None is that of `numerics`, or the built-in one.
     threads : worker threads, 0 for all cores.
 
     Returns
@@ -50,11 +53,13 @@ def replay_log(
     Raises
     ------
     UsageError
-        A parameter that the model does not have, or a value that is not finite.
+        A parameter that the model does not have, a value that is not finite, or an unknown simulator.
     """
     model = parameters if isinstance(parameters, Model) else set_parameters(robot, parameters or {})
     episodes = split_episodes(log)
-    chosen = choose_numerics(robot.for_log(log), episodes[0], threads)[0] if numerics is None else numerics
+    if numerics is None:
+        numerics, _ = choose_numerics(robot.for_log(log), episodes[0], threads, simulator or MUJOCO)
+    chosen = on_simulator(numerics, simulator)
     parts: dict[str, list[FloatArray]] = {}
     for episode in episodes:
         run = Replay(robot.for_log(episode), episode, model.terms, chosen, effort=True, threads=threads)

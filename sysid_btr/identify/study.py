@@ -20,6 +20,7 @@ from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.registry import on_simulator
 from sysid_btr.simulation.servo import ServoLaw
 from sysid_btr.terms.base import BatchModel, Term
 from sysid_btr.terms.grammar import parse_parameters
@@ -153,6 +154,7 @@ def make_study(
     holdout: float | Sequence[Log] = 0.3,
     channels: Sequence[str] = FITTED,
     numerics: Numerics | None = None,
+    simulator: str | None = None,
     threads: int = 0,
     executor: Executor = HERE,
 ) -> Study:
@@ -165,6 +167,7 @@ def make_study(
     holdout : the last fraction of each log, or other logs.
     channels : channels to fit, of ``position``, ``velocity``, ``effort``.
     numerics : integrator and step; None chooses by a convergence check on the log.
+    simulator : what moves the model, by name; None is that of `numerics`, or the built-in one.
     threads : worker threads, 0 for all cores.
     executor : where candidates are simulated: this process, or what `open_executor` gives.
 
@@ -173,8 +176,9 @@ def make_study(
     ModelError
         If a log and the model have nothing in common.
     UsageError
-        If the held-out fraction is not between 0 and 1.
+        If the held-out fraction is not between 0 and 1, or there is no such simulator.
     """
+    given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):
         parts = [split_episode(robot, e, float(holdout), threads) for e in recordings]
@@ -187,15 +191,15 @@ def make_study(
         train=tuple(train),
         holdout=tuple(held),
         channels=tuple(c for c in COMPARED if c in channels),
-        numerics=Numerics("RK4", 0.005) if numerics is None else numerics,
+        numerics=given,
         numerics_error=np.nan,
         threads=threads,
         executor=executor,
     )
     if numerics is None:
         leading = max(train, key=lambda e: e.procedure.demand)
-        numerics, error = leading.choose_numerics(threads)
-        study = replace(study, numerics=numerics, numerics_error=error)
+        chosen, error = leading.choose_numerics(threads, given.simulator)
+        study = replace(study, numerics=chosen, numerics_error=error)
     return study.with_initial_states(Model.of(()))
 
 
