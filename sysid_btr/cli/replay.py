@@ -119,10 +119,10 @@ def _compare(
         return
     screen = console(sys.stdout)
     show(result, screen)
-    position = scores.get("position")
-    if position is not None:
-        unit = result["units"]["position"].partition(",")[0]
-        screen.print(joints_table(position.joints, unit))
+    channel = study.leading_channel
+    if channel in scores:
+        unit = result["units"][channel].partition(",")[0]
+        screen.print(joints_table(scores[channel].joints, channel, unit))
 
 
 def _rehearse(

@@ -52,10 +52,10 @@ def message_of(
     before: Scores,
     after: Scores,
     left: Mapping[str, Any] | None,
+    channel: str = "position",
     unit: str = "rad",
 ) -> str:
     """The verdict in one sentence, with the held-out error before and after; `effects` are the best there are."""
-    channel = "position"
     errors = ""
     if channel in before.holdout and channel in after.holdout:
         old, new, floor = si_all(

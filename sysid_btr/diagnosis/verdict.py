@@ -11,6 +11,7 @@ from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
 from sysid_btr.identify.refit import Fitted, judge
 from sysid_btr.identify.scores import score
+from sysid_btr.models.robot import channel_units
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.library import select_effects
 
@@ -41,11 +42,12 @@ def conclude(state: State, verdict: Verdict, rules: Selection, seconds: float) -
     if reported is None:
         reported = judge(study, first.model) if study.procedure.fuses else state.fitted
     after = score(study, reported.model)
-    unit = "m" if all(s.slide for s in study.scales.values()) else "rad"
+    channel = study.leading_channel
+    unit = channel_units(study.robot)[channel].partition(",")[0]
     return Closing(
         study=study,
         verdict=verdict,
-        message=message_of(verdict, named, first.before, after, left, unit),
+        message=message_of(verdict, named, first.before, after, left, channel, unit),
         noise_floor={c: s.floor for c, s in first.before.holdout.items()},
         nominal=first.nominal,
         before=first.before,

@@ -178,10 +178,10 @@ def problems_table(problems: Sequence[Finding]) -> Table:
     return table
 
 
-def joints_table(joints: Mapping[str, float], unit: str) -> Table:
-    """Error of each joint, worst first."""
+def joints_table(joints: Mapping[str, float], channel: str, unit: str) -> Table:
+    """Error of a channel at each joint, worst first."""
     table = _table("joint")
-    table.add_column("position error (rmse)", justify="right")
+    table.add_column(f"{channel} error (rmse)", justify="right")
     order = sorted(joints, key=lambda name: -joints[name])
     for name, text in zip(order, si_all([joints[name] for name in order], unit), strict=True):
         table.add_row(name, text)

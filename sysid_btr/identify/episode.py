@@ -167,6 +167,11 @@ class Episode(ABC):
         """(n,) samples of `log` that count and are replayed."""
         return self.scored[: len(self.log)]
 
+    def logged(self, channels: Sequence[str]) -> tuple[str, ...]:
+        """Those of the channels that the log has of any joint of the model."""
+        joints = joint_names(self.robot.for_log(self.log))
+        return tuple(c for c in channels if any(self.log.has(c, j) for j in joints))
+
     @abstractmethod
     def replay(self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0) -> Replay:
         """Its replay under some terms."""
@@ -187,9 +192,7 @@ class Episode(ABC):
         ModelError
             If there is nothing to compare.
         """
-        log = self.log
-        joints = joint_names(self.robot.for_log(log))
-        present = tuple(c for c in channels if any(log.has(c, j) for j in joints))
+        log, present = self.log, self.logged(channels)
         replay = self.replay(terms, numerics, effort="effort" in present, threads=threads)
         targets = make_targets(log, replay.index.joints, present, self.warm_up)
         if not targets:

@@ -75,14 +75,12 @@ class Fit:
         """The outcome in one sentence."""
         identifiable = sum(e.identifiable != "no" for e in self.estimates)
         parts = [f"{identifiable} of {len(self.estimates)} parameters are identifiable from this log"]
-        if "position" in self.before.holdout:
-            nominal, before = self.nominal.holdout["position"], self.before.holdout["position"]
-            unit = channel_units(self.study.robot)["position"].partition(",")[0]
+        channel = self.study.leading_channel
+        if channel in self.before.holdout:
+            nominal, before = self.nominal.holdout[channel], self.before.holdout[channel]
+            unit = channel_units(self.study.robot)[channel].partition(",")[0]
             first, last, floor = si_all([nominal.rmse, before.rmse, before.floor], unit)
-            parts.append(
-                f"the held-out position error goes from {first} to {last}, "
-                f"with a noise floor of {floor}"
-            )
+            parts.append(f"the held-out {channel} error goes from {first} to {last}, with a noise floor of {floor}")
         if not self.result.converged:
             parts.append("the fit did not converge")
         return "; ".join(parts) + "."

@@ -42,12 +42,13 @@ def replay_result(
     study: Study, scores: Mapping[str, ChannelScore], parameters: Mapping[str, float], wall_s: float
 ) -> dict[str, Any]:
     """Content of a result of kind ``replay``: nothing is fitted, so all data counts as held out."""
-    position = scores.get("position")
+    channel = study.leading_channel
+    leading = scores.get(channel)
     message = "the replay diverged"
-    if position is not None and math.isfinite(position.rmse):
-        unit = channel_units(study.robot)["position"].partition(",")[0]
-        error, floor = si_all([position.rmse, position.floor], unit)
-        message = f"position error {error}, with a noise floor of {floor}."
+    if leading is not None and math.isfinite(leading.rmse):
+        unit = channel_units(study.robot)[channel].partition(",")[0]
+        error, floor = si_all([leading.rmse, leading.floor], unit)
+        message = f"{channel} error {error}, with a noise floor of {floor}."
     found = {
         "kind": "replay",
         "message": message,

@@ -60,6 +60,11 @@ class Study:
     executor: Executor = HERE
     journal: Journal | None = None
 
+    @property
+    def leading_channel(self) -> str:
+        """The first channel that is fitted and logged; sentences and pictures speak of it."""
+        return next(c for c in self.channels if any(c in e.logged(self.channels) for e in self.train))
+
     @cached_property
     def scales(self) -> Scales:
         """Sizes of torques and motions at every joint in the plain model on these logs."""

@@ -12,7 +12,7 @@ from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.report.style import FOUND, MODEL_COLOURS, PLAIN, SHADE, faint, ink, new_figure, on_page
 from sysid_btr.terms.model import Model
-from sysid_btr.units import si_all
+from sysid_btr.units import CHANNEL_UNITS, si_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,15 +37,17 @@ class Trace:
     Attributes
     ----------
     joint : name, with the log's where there are several.
-    unit : of the position.
+    channel : what is compared.
+    unit : of what is compared.
     time : (n,) s since the first sample.
-    command, measured : (n,) NaN where missing.
+    command, measured : (n,) NaN where missing; the command is a position whatever is compared.
     predicted : name of the model -> (n,), from the plain model to the final one.
     split : (s) held out from here on.
     noise : noise floor of the sensor.
     """
 
     joint: str
+    channel: str
     unit: str
     time: FloatArray
     command: FloatArray
@@ -99,22 +101,21 @@ def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, .
     predicted: list[dict[str, FloatArray]] = [{} for _ in range(count)]
     for name, model in models:
         for i, episode in enumerate(study.holdout_problem(model).episodes[:count]):
-            predicted[i][name] = episode.replay.predict(model.values[None]).position[0]
+            predicted[i][name] = episode.targets[0].predicted(episode.replay.predict(model.values[None]))[0]
     plain = study.holdout_problem(())
     for i, episode in enumerate(plain.episodes[:count]):
-        log, joints = study.holdout[i].log, episode.replay.index.joints
+        log, target = study.holdout[i].log, episode.targets[0]
         label = f" ({log.path.stem})" if several and log.path is not None else ""
-        target = next(t for t in episode.targets if t.channel == "position")
         for k, joint in enumerate(target.joints):
-            column = joints.index(joint)
             traces.append(
                 Trace(
                     joint=joint + label,
-                    unit="m" if slides(episode.replay.model, joint) else "rad",
+                    channel=target.channel,
+                    unit=CHANNEL_UNITS[target.channel][slides(episode.replay.model, joint)],
                     time=log.time - log.time[0],
                     command=log.channels.get(f"command.{joint}", np.full(len(log), np.nan)),
                     measured=target.measured[:, k],
-                    predicted={name: p[:, column] for name, p in predicted[i].items()},
+                    predicted={name: p[:, k] for name, p in predicted[i].items()},
                     split=study.holdout[i].begin,
                     noise=float(target.noise[k]),
                 )
@@ -274,8 +275,9 @@ def _draw_row(row: Sequence[Axes], item: Trace) -> None:
 
 
 def _draw_lines(axis: Axes, item: Trace, begin: float, end: float) -> None:
-    x, y = _window(item.time, item.command, begin, end)
-    axis.plot(x, y, color=faint(), lw=0.8, ls="--", drawstyle="steps-post", label="command")
+    if item.channel == "position":
+        x, y = _window(item.time, item.command, begin, end)
+        axis.plot(x, y, color=faint(), lw=0.8, ls="--", drawstyle="steps-post", label="command")
     x, y = _window(item.time, item.measured, begin, end)
     axis.plot(x, y, color=ink(), lw=1.6, label="log")
     for name, colour in _coloured(item):

@@ -151,20 +151,26 @@ def _error_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _bars(result: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Held-out position error of each joint under each model, as fractions of the largest, worst first."""
+    """Held-out error of each joint under each model, as fractions of the largest, worst first.
+
+    Of the first channel that was fitted and scored.
+    """
     columns = stages(result)
-    scores = [result[key].get("holdout", {}).get("position") for key, _ in columns]
+    scored = [result[key].get("holdout", {}) for key, _ in columns]
+    channel = next((c for c in result.get("channels", ()) if all(c in s for s in scored)), "position")
+    scores = [s.get(channel) for s in scored]
     if not scores or any(s is None or not s.get("joints") for s in scores):
         return None
-    unit = result["units"].get("position", "rad").partition(",")[0]
+    unit = result["units"].get(channel, "rad").partition(",")[0]
     values = {j: [s["joints"].get(j) or 0.0 for s in scores] for j in scores[0]["joints"]}
     largest = max((max(v) for v in values.values()), default=0.0)
     if largest <= 0:
         return None
-    floor = result["noise_floor"].get("position")
+    floor = result["noise_floor"].get(channel)
     order = sorted(values, key=lambda j: -max(values[j]))
     texts = iter(si_all([v for j in order for v in values[j]], unit))
     return {
+        "channel": channel,
         "names": [name for _, name in columns],
         "floor": None if floor is None else min(100 * floor / largest, 100),
         "joints": [
