@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sysid_btr.run_folder import DRAWS, RESULT, Folder, open_folder
+from sysid_btr.run_folder import DRAWS, Folder, open_folder
 
 if TYPE_CHECKING:
     from sysid_btr.diagnosis.closing import Closing
@@ -38,28 +38,24 @@ def save(
 
 
 def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[str, Any]) -> Path:
-    """Write all files of a run; the result last, because its presence says that the run is complete.
+    """Write all files of a run: what was computed, and then what is drawn of it.
 
     The result is given what the model became, and what was drawn.
     """
     from sysid_btr.posterior.outcome import Posterior
-    from sysid_btr.report.pictures import keep, pictures_of, write_report
-    from sysid_btr.result import to_json
+    from sysid_btr.report.pictures import pictures_of, write_pages
     from sysid_btr.writeback.write import describe_model
 
     if isinstance(outcome, Posterior):
         from sysid_btr.posterior.export import netcdf
 
         folder.write(DRAWS, netcdf(outcome))
-    result["pictures"] = keep(folder, pictures_of(outcome))
     describe_model(as_model(outcome), result, folder)
-    report = write_report(folder, result)
-    folder.write(RESULT, to_json(result))
-    return report
+    return write_pages(folder, result, pictures_of(outcome))
 
 
 def save_motion(folder: Folder, design: Design, result: dict[str, Any]) -> Path:
-    """Write motion, figure, report and result of a designed motion; the result last, as in `write_all`.
+    """Write motion, result, figure and report of a designed motion.
 
     Returns
     -------
@@ -69,14 +65,10 @@ def save_motion(folder: Folder, design: Design, result: dict[str, Any]) -> Path:
     from sysid_btr.excite.outcome import MOTION
     from sysid_btr.io.parquet import write_log
     from sysid_btr.report.excitation import plot_motion
-    from sysid_btr.report.pictures import keep, write_report
-    from sysid_btr.result import to_json
+    from sysid_btr.report.pictures import write_pages
 
     write_log(design.log, folder.path / MOTION, overwrite=True)
-    result["pictures"] = keep(folder, [("excite", lambda: plot_motion(design))])
-    report = write_report(folder, result)
-    folder.write(RESULT, to_json(result))
-    return report
+    return write_pages(folder, result, [("excite", lambda: plot_motion(design))])
 
 
 def as_model(outcome: Fit | Closing | Posterior) -> Fit | Closing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from terminal import Cli
 
@@ -23,8 +25,10 @@ from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.figures import correlate, plot_convergence, plot_overlay, plot_residuals, trace_outcome
 from sysid_btr.report.html import Picture, render
-from sysid_btr.report.style import DARK, LIGHT, ink, page
+from sysid_btr.report.pictures import write_pages
+from sysid_btr.report.style import DARK, LIGHT, ink, new_figure, page
 from sysid_btr.result import read_result
+from sysid_btr.run_folder import Folder
 
 SAMPLES = sample_logs()
 PENDULUM = ("--model", str(SAMPLES / "pendulum.xml"), "--threads", "1")
@@ -68,6 +72,48 @@ def test_the_report_can_be_written_again_from_the_folder(cli: Cli, folders: Path
     assert file.read_bytes() == before
 
 
+@pytest.mark.parametrize("listed", ["/etc/hostname", "../secret.png", "secret.txt", "link.png", "text.png", 7])
+def test_a_folder_from_somebody_else_shows_nothing_of_this_machine(
+    cli: Cli, folders: Path, tmp_path: Path, listed: object
+) -> None:
+    theirs = tmp_path / "theirs"
+    shutil.copytree(folders / "fit", theirs)
+    (theirs / "report.html").unlink()
+    (tmp_path / "secret.png").write_text("secret")
+    (theirs / "text.png").write_text("secret")
+    (theirs / "link.png").symlink_to(tmp_path / "secret.png")
+    result = read_result(theirs)
+    (theirs / "result.json").write_text(json.dumps({**result, "pictures": [listed]}))
+    answer = cli("report", theirs)
+    assert answer.code == 2
+    assert f"{listed}: pictures are PNG files in the same folder" in answer.err
+    assert not (theirs / "report.html").exists()
+
+
+def test_a_picture_that_cannot_be_drawn_costs_no_more_than_itself(folders: Path, tmp_path: Path) -> None:
+    result = read_result(folders / "fit")
+
+    def fails() -> Figure:
+        assert read_result(tmp_path)["message"] == result["message"], "written before anything is drawn"
+        raise ValueError("no such axis")
+
+    write_pages(Folder(tmp_path), result, [("overlay", fails), ("trace", lambda: new_figure(2, 1))])
+    assert read_result(tmp_path)["pictures"] == ["trace.png"]
+    assert read_result(tmp_path)["not_drawn"] == ["overlay.png: ValueError: no such axis"]
+    assert "no such axis" in (tmp_path / "report.html").read_text()
+
+
+def test_what_was_fitted_is_what_everything_speaks_of(cli: Cli, tmp_path: Path) -> None:
+    asked = ("--model", SAMPLES / "pendulum.xml", "--log", SAMPLES / "pendulum_weak.parquet", "--fit", "kp:*")
+    out = tmp_path / "out"
+    answer = cli("fit", *asked, "--channels", "effort", "--out", out)
+    assert answer.code == 0, answer.err
+    result = read_result(out)
+    assert "held-out effort error goes from" in result["message"]
+    assert "Held-out effort error of each joint" in (out / "report.html").read_text()
+    assert "position error" not in (out / "report.html").read_text()
+
+
 @pytest.mark.parametrize("kind", RUNS)
 def test_every_report_is_one_small_offline_file_for_light_and_dark(folders: Path, kind: str) -> None:
     text = (folders / kind / "report.html").read_text()
@@ -76,6 +122,7 @@ def test_every_report_is_one_small_offline_file_for_light_and_dark(folders: Path
         assert outside not in text
     result = read_result(folders / kind)
     assert result["message"].split("+-")[0] in text.replace("&#39;", "'")
+    assert "not_drawn" not in result
     count = len(result["pictures"])
     assert count >= 1
     assert text.count('<img src="data:image/png;base64,') == count

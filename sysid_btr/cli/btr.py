@@ -23,7 +23,7 @@ from sysid_btr.cli.options import option
 from sysid_btr.cli.terminal import print_result, remark
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.progress import Interrupted, ProgressLine
-from sysid_btr.run_folder import OVERLAY, RESULT, Folder, open_folder
+from sysid_btr.run_folder import OVERLAY, Folder, open_folder
 
 if TYPE_CHECKING:
     from sysid_btr.btr.controllers import ControllerSpace
@@ -217,15 +217,12 @@ def robot_of(options: BtrOptions, model: Model, task: Walk, space: ControllerSpa
 
 
 def _write(folder: Folder, result: dict[str, Any]) -> None:
-    """Write figures, report and, last, result.json."""
+    """Write result.json, figures and report."""
     from sysid_btr.report.btr import plot_btr
     from sysid_btr.report.figures import figure_of
-    from sysid_btr.report.pictures import keep, write_report
-    from sysid_btr.result import to_json
+    from sysid_btr.report.pictures import write_pages
 
-    result["pictures"] = keep(folder, [(Path(OVERLAY).stem, lambda: figure_of(plot_btr(result)))])
-    remark(f"report: {write_report(folder, result)}")
-    folder.write(RESULT, to_json(result))
+    remark(f"report: {write_pages(folder, result, [(Path(OVERLAY).stem, lambda: figure_of(plot_btr(result)))])}")
 
 
 def _open(out: Path, resume: bool, overwrite: bool) -> Folder:

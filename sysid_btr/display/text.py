@@ -81,6 +81,8 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield Text(f"profile of {p['name']}: 95 % within {low} .. {high}, the others fitted anew")
     if result.get("converged") is False:
         yield Text(result["termination"], style="bold")
+    for missing in result.get("not_drawn", []):
+        yield Text(f"could not be drawn: {missing}", style="bold")
     for walk in result.get("walks", []):
         if walk["part"] == "train":
             yield Text("; ".join(walk_words(walk)), style="dim")

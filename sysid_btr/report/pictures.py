@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sysid_btr.errors import UsageError
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.style import on_page
 from sysid_btr.run_folder import OVERLAY, REPORT, RESULT, Folder
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 DARK = "dark"
 """Folder of the pictures for a dark page."""
+PNG = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a picture."""
 
 
 @dataclass(frozen=True)
@@ -101,15 +104,15 @@ def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]
     from sysid_btr.report.figures import figure_of, plot_convergence, plot_overlay, plot_residuals, trace_outcome
 
     model = outcome.as_fit if isinstance(outcome, Posterior) else outcome
-    traces = trace_outcome(model)
-    yield "overlay", lambda: figure_of(plot_overlay(traces))
+    traces = cache(lambda: trace_outcome(model))
+    yield "overlay", lambda: figure_of(plot_overlay(traces()))
     if isinstance(outcome, Posterior):
         from sysid_btr.report.posterior import plot_bands, plot_corner, plot_trace
 
         yield "predictive", lambda: figure_of(plot_bands(outcome))
         yield "corner", lambda: figure_of(plot_corner(outcome))
         yield "trace", lambda: figure_of(plot_trace(outcome))
-    yield "residuals", lambda: figure_of(plot_residuals(traces))
+    yield "residuals", lambda: figure_of(plot_residuals(traces()))
     if isinstance(outcome, Fit):
         for profile in outcome.profiles:
             yield f"profile_{file_name(profile.name)}", partial(_profile, profile)
@@ -124,23 +127,61 @@ def _profile(profile: Profile) -> Figure:
     return figure_of(plot_profile(profile))
 
 
-def keep(folder: Folder, pictures: Iterable[tuple[str, Draw]]) -> list[str]:
-    """Draw pictures for light and dark pages and write them; the names of their files."""
-    names = []
+def write_pages(folder: Folder, result: dict[str, Any], pictures: Iterable[tuple[str, Draw]]) -> Path:
+    """Write result.json, then pictures and report; a picture that cannot be drawn costs no more than itself.
+
+    The result is written before anything is drawn, and again with the names of the pictures.
+
+    Returns
+    -------
+    Path
+        The report.
+    """
+    from sysid_btr.result import to_json
+
+    folder.write(RESULT, to_json(result))
+    names, failed = _keep(folder, pictures)
+    result["pictures"] = names
+    if failed:
+        result["not_drawn"] = failed
+    report = write_report(folder, result)
+    folder.write(RESULT, to_json(result))
+    return report
+
+
+def _keep(folder: Folder, pictures: Iterable[tuple[str, Draw]]) -> tuple[list[str], list[str]]:
+    """Draw pictures for light and dark pages and write them; names of their files, and why others are missing."""
+    names, failed = [], []
     dark = folder.within(DARK)
     for name, draw in pictures:
-        folder.write(f"{name}.png", on_page(draw))
-        dark.write(f"{name}.png", on_page(draw, dark=True))
+        try:
+            light_page, dark_page = on_page(draw), on_page(draw, dark=True)
+        except Exception as error:
+            failed.append(f"{name}.png: {type(error).__name__}: {error}")
+            continue
+        folder.write(f"{name}.png", light_page)
+        dark.write(f"{name}.png", dark_page)
         names.append(f"{name}.png")
-    return names
+    return names, failed
 
 
 def write_report(folder: Folder, result: Mapping[str, Any]) -> Path:
     """Write report.html from a result and the pictures in the folder.
 
     Pictures that result.json lists and that are gone are left out.
+
+    Raises
+    ------
+    UsageError
+        If it lists anything but PNG files of this folder: a result may come from somebody else, and the page with
+        what is in it may go to others.
     """
     names = result.get("pictures", [OVERLAY])
+    strange = [str(name) for name in names if not _is_picture(folder.path, name)]
+    if strange:
+        raise UsageError(
+            f"{folder.path / RESULT} lists as pictures {', '.join(strange)}: pictures are PNG files in the same folder"
+        )
     return folder.write(REPORT, render(result, [p for name in names for p in _picture(folder.path, name, result)]))
 
 
@@ -151,6 +192,15 @@ def rewrite(folder: Folder, result: dict[str, Any], picture: str) -> None:
     result["pictures"] = [*result["pictures"][:1], picture, *result["pictures"][1:]]
     write_report(folder, result)
     folder.write(RESULT, to_json(result))
+
+
+def _is_picture(folder: Path, name: Any) -> bool:
+    """Whether a name is that of a PNG file of the folder itself, or of none."""
+    if not isinstance(name, str) or Path(name).name != name or Path(name).suffix != ".png":
+        return False
+    inside = folder.resolve()
+    files = [file for file in (folder / name, folder / DARK / name) if file.exists()]
+    return all(f.resolve().is_relative_to(inside) and f.read_bytes().startswith(PNG) for f in files)
 
 
 def _picture(folder: Path, name: str, result: Mapping[str, Any]) -> Iterator[Picture]:
