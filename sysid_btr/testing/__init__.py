@@ -35,10 +35,12 @@ from sysid_btr.testing.problems import (
     rosenbrock,
 )
 from sysid_btr.testing.require import require
+from sysid_btr.testing.simulator import SIMULATOR_CHECKS, check_simulator
 
 __all__ = [
     "ESTIMATOR_CHECKS",
     "IMPORTER_CHECKS",
+    "SIMULATOR_CHECKS",
     "Killed",
     "LossOnly",
     "ToyProblem",
@@ -55,6 +57,7 @@ __all__ = [
     "check_reproducible",
     "check_result",
     "check_resume",
+    "check_simulator",
     "exponential_decay",
     "failing_region",
     "hopeless",
