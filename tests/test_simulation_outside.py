@@ -135,6 +135,10 @@ class Forgetful:
         return self.change(MujocoBatch().rollout(setup, borders, threads=threads))
 
 
+def all_failed(states: States) -> States:
+    return replace(states, failed=np.ones(len(states.failed), dtype=bool))
+
+
 def all_is_well(states: States) -> States:
     kept = np.nan_to_num(states.motor), np.nan_to_num(states.motor_velocity)
     return replace(states, position=kept[0], velocity=kept[1], failed=np.zeros(len(states.failed), dtype=bool))
@@ -169,7 +173,7 @@ class Drifting:
         (Broken(spoiling), "the second time"),
         (Drifting(), "the second time"),
         (Forgetful(all_is_well), "not said to have failed"),
-        (Forgetful(lambda states: replace(states, failed=np.ones(len(states.failed), dtype=bool))), "said to have failed"),
+        (Forgetful(all_failed), "said to have failed"),
     ],
 )
 def test_what_breaks_it_is_found(simulator: Broken | Forgetful | Drifting, words: str) -> None:
