@@ -211,6 +211,15 @@ def pool() -> Iterator[DaskExecutor]:
         yield executor
 
 
+def test_a_cluster_of_our_own_listens_to_this_machine_alone(pool: DaskExecutor) -> None:
+    import psutil
+
+    here = psutil.Process()
+    sockets = [c for p in (here, *here.children(recursive=True)) for c in p.net_connections(kind="inet")]
+    listening = {c.laddr.ip for c in sockets if c.status == psutil.CONN_LISTEN}
+    assert listening == {"127.0.0.1"}
+
+
 @cache
 def fit_here() -> Fit:
     return run_fit(study())

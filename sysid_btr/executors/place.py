@@ -87,7 +87,7 @@ def _client(distributed: Any, place: str, count: int | None) -> Iterator[Any]:
                 n_workers=count,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=":0",
+                dashboard_address="127.0.0.1:0",  # else it listens on all addresses, without a password
                 silence_logs=logging.CRITICAL,
             )
         with closing(cluster), distributed.Client(cluster, set_as_default=False) as client:
