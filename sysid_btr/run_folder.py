@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 import secrets
-from dataclasses import dataclass
+import socket
+from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
+from typing import IO
+from weakref import finalize
 
 from sysid_btr.errors import UsageError
 
@@ -16,13 +20,81 @@ JOURNAL = "journal.jsonl"
 MODEL = "model.xml"
 PARAMS = "params.json"
 DRAWS = "posterior.nc"
+LOCK = ".lock"
+
+
+class Lock:
+    """A folder held by this process, for as long as this object lives; the system frees it if the process dies."""
+
+    def __init__(self, folder: Path, file: IO[str]) -> None:
+        self._free = finalize(self, _free, folder / LOCK, file)
+
+    @classmethod
+    def take(cls, folder: Path) -> Lock | None:
+        """Hold a folder; None where the system has no such locks, or this process holds it already.
+
+        Raises
+        ------
+        UsageError
+            If another process holds it; says which, and since when.
+        """
+        try:
+            import fcntl
+        except ImportError:
+            return None
+        file = (folder / LOCK).open("a+", encoding="utf-8")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read()
+            file.close()
+            if holder.startswith(_process()):
+                return None
+            raise UsageError(
+                f"--out {folder} is in use by {holder or 'another process'}: wait until that has ended, or choose "
+                "another folder"
+            ) from None
+        except OSError:  # a network folder without locks
+            file.close()
+            return None
+        if not _is_there(folder / LOCK, file):  # its holder ended between the two calls above
+            file.close()
+            return cls.take(folder)
+        file.truncate(0)
+        file.write(f"{_process()} since {datetime.now():%Y-%m-%d %H:%M:%S}")
+        file.flush()
+        return cls(folder, file)
+
+
+def _process() -> str:
+    return f"process {os.getpid()} on {socket.gethostname()}"
+
+
+def _is_there(path: Path, file: IO[str]) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+def _free(path: Path, file: IO[str]) -> None:
+    path.unlink(missing_ok=True)
+    file.close()
 
 
 @dataclass(frozen=True)
 class Folder:
-    """The output folder of a run; its files appear complete or not at all."""
+    """The output folder of a run; its files appear complete or not at all.
+
+    Attributes
+    ----------
+    path : where it is.
+    lock : what keeps other processes from writing there, if it was opened by `open_folder`.
+    """
 
     path: Path
+    lock: Lock | None = field(default=None, compare=False, repr=False)
 
     @property
     def journal(self) -> Path:
@@ -75,6 +147,13 @@ class Folder:
         return target
 
 
+def _locked(path: Path) -> Lock | None:
+    try:
+        return Lock.take(path)
+    except OSError as error:
+        raise UsageError(f"--out {path} cannot be written: {error.strerror}; choose another folder") from error
+
+
 def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) -> Folder:
     """Make or reuse an output folder.
 
@@ -87,7 +166,7 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
     Raises
     ------
     UsageError
-        If it holds results and neither is asked for, or it cannot be used.
+        If it holds results and neither is asked for, another process writes there, or it cannot be used.
     """
     if resume and overwrite:
         raise UsageError("--resume continues the run that is there and --overwrite deletes it: give one of the two")
@@ -99,7 +178,7 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
         raise UsageError(
             f"--out {path} cannot be created: {error.strerror}; choose another folder"
         ) from error
-    folder = Folder(path)
+    folder = Folder(path, _locked(path))
     if folder.held and not (resume or overwrite):
         raise UsageError(
             f"--out {path} already holds results ({', '.join(folder.held)}), which are not touched: --resume "

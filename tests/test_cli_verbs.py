@@ -337,6 +337,22 @@ def test_close_names_the_effect_and_resumes(cli: Cli, bench: Path, tmp_path: Pat
     assert json.loads(again.out)["effects"] == result["effects"]
 
 
+def test_a_folder_that_another_process_writes_is_refused_until_that_ends(cli: Cli, bench: Path, tmp_path: Path) -> None:
+    hold = "import sys, time; from pathlib import Path; from sysid_btr.run_folder import open_folder; "
+    hold += "held = open_folder(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    asked = ("fit", "--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--fit", "kp:*", "--out", tmp_path)
+    with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        answer = cli(*asked)
+        other.kill()
+    assert answer.code == 2
+    assert f"in use by process {other.pid} on" in answer.err
+    assert "since 20" in answer.err
+    answer = cli(*asked)
+    assert answer.code == 0, answer.err
+
+
 def test_close_without_fit_says_what_it_fits(cli: Cli, bench: Path) -> None:
     asked = ("--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--effects", "coulomb_friction")
     answer = cli("close", *asked)
