@@ -60,7 +60,8 @@ class Source:
         robot: Robot = load_robot(self.model)
         log: Log = read_log(self.log)
         log = log.window(0, int(np.searchsorted(log.time, log.time[0] + self.seconds)) + 1)
-        study = make_study(robot, [log], holdout=[log], threads=threads)
+        logs = [log]
+        study = make_study(robot, logs, holdout=logs, threads=threads)
         return study.train_problem(study.declare(list(self.fit)))
 
 

@@ -337,6 +337,17 @@ def test_close_names_the_effect_and_resumes(cli: Cli, bench: Path, tmp_path: Pat
     assert json.loads(again.out)["effects"] == result["effects"]
 
 
+def test_the_same_recording_counts_once_whatever_it_is_called(cli: Cli, bench: Path, tmp_path: Path) -> None:
+    asked = ("fit", "--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--fit", "kp:*")
+    log = read_log(bench / "arm.parquet")
+    copy = tmp_path / "copy.parquet"
+    write_log(replace(log, time=log.time + 3.0, meta=replace(log.meta, notes="a copy")), copy)
+    for again in (("--log", bench / "arm.parquet"), ("--log", copy), ("--holdout", copy)):
+        answer = cli(*asked, *again)
+        assert answer.code == 2
+        assert f"{again[1]} holds the same recording as {bench / 'arm.parquet'}" in answer.err
+
+
 def test_a_folder_that_another_process_writes_is_refused_until_that_ends(cli: Cli, bench: Path, tmp_path: Path) -> None:
     hold = "import sys, time; from pathlib import Path; from sysid_btr.run_folder import open_folder; "
     hold += "held = open_folder(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"

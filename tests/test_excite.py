@@ -190,7 +190,8 @@ def test_predicted_intervals_are_those_that_a_fit_gives() -> None:
     (target,) = episode.targets
     channels = {f"position.{j}": target.measured[:, k] for k, j in enumerate(target.joints)}
     measured = replace(log, channels={**log.channels, **channels})
-    study = make_study(known.robot, [measured], holdout=[measured], numerics=known.numerics, threads=1)
+    logs = [measured]
+    study = make_study(known.robot, logs, holdout=logs, numerics=known.numerics, threads=1)
     found = fit(study, ASKED)
     for own, foreseen in zip(found.estimates, expect(problem).estimates, strict=True):
         # a fit's standard error also has the spread between stretches of the log, of which there are a dozen

@@ -9,6 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.errors import UsageError
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure, episode_of, split_episode
@@ -169,7 +170,7 @@ def make_study(
     ----------
     robot : model.
     logs : recordings to fit; each episode is replayed by itself.
-    holdout : the last fraction of each log, or other logs.
+    holdout : the last fraction of each log, or other logs; `logs` themselves where nothing will be fitted.
     channels : channels to fit, of ``position``, ``velocity``, ``effort``.
     numerics : integrator and step; None chooses by a convergence check on the log.
     simulator : what moves the model, by name; None is that of `numerics`, or the built-in one.
@@ -181,16 +182,20 @@ def make_study(
     ModelError
         If a log and the model have nothing in common.
     UsageError
-        If the held-out fraction is not between 0 and 1, or there is no such simulator.
+        If a recording is given twice, the held-out fraction is not between 0 and 1, or there is no such simulator.
     """
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):
+        _refuse_repeats(recordings)
         parts = [split_episode(robot, e, float(holdout), threads) for e in recordings]
         train, held = [fitted for fitted, _ in parts], [left for _, left in parts]
     else:
+        judged = [e for log in holdout for e in split_episodes(log)]
+        if holdout is not logs:
+            _refuse_repeats((*recordings, *judged))
         train = [episode_of(robot, e, threads) for e in recordings]
-        held = [episode_of(robot, e, threads) for log in holdout for e in split_episodes(log)]
+        held = [episode_of(robot, e, threads) for e in judged]
     study = Study(
         robot=robot,
         train=tuple(train),
@@ -206,6 +211,21 @@ def make_study(
         chosen, error = leading.choose_numerics(threads, given.simulator)
         study = replace(study, numerics=chosen, numerics_error=error)
     return study.with_initial_states(Model.of(()))
+
+
+def _refuse_repeats(recordings: Iterable[Log]) -> None:
+    """Refuse data that would count twice, or that would judge what was fitted to them."""
+    first: dict[str, Log] = {}
+    problems = []
+    for log in recordings:
+        known = first.setdefault(log.content, log)
+        if known is not log:
+            problems.append(f"{log.path or 'a log'} holds the same recording as {known.path or 'another log'}")
+    if problems:
+        raise UsageError(
+            "\n".join(problems) + "\nThe same data twice make intervals too narrow, and held out they judge nothing: "
+            "give each recording once."
+        )
 
 
 def measure_scales(

@@ -227,6 +227,16 @@ class Log:
         """The log itself, without what was found of it."""
         return {name: value for name, value in vars(self).items() if name != "_found"}
 
+    @property
+    def content(self) -> str:
+        """Digest of what was recorded, wherever it is kept and whenever its clock began."""
+        from hashlib import sha256
+
+        digest = sha256(np.round(self.time - self.time[:1], 9).tobytes())
+        for name in sorted(self.channels):
+            digest.update(name.encode() + self.channels[name].tobytes())
+        return digest.hexdigest()
+
     def episodes(self) -> tuple[slice, ...]:
         """Row ranges of the episodes: the runs of equal episode number, in row order."""
         if len(self) == 0:
