@@ -36,10 +36,11 @@ from sysid_btr.simulation.batching import batched_chunks, group_replays
 from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps, step_inputs
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
+from sysid_btr.simulation.segments import WindowReplay, Windows
 from sysid_btr.simulation.start import initial_state
 from sysid_btr.terms.friction import CoulombFriction, StribeckFriction
 from sysid_btr.terms.grammar import parse_parameters
-from sysid_btr.terms.servo import IntegralGain
+from sysid_btr.terms.servo import BackEmf, IntegralGain
 
 ARM = ("arm",)
 ZERO = np.zeros(1)
@@ -416,6 +417,27 @@ def test_an_input_without_any_value_is_left_out() -> None:
     log = held(0.0, 0.1)
     empty = replace(log, channels={**log.channels, "voltage.arm": np.full(len(log), np.nan)})
     assert step_inputs(empty, make_grid(empty, ARM, ZERO, 0.005)) == {}
+
+
+def test_a_law_in_a_segment_reads_the_inputs_of_its_own_time() -> None:
+    """A segment in the middle of a log moves as one at the beginning of what is left of the log there."""
+    log = swing(seconds=0.6)
+    enabled = np.repeat([1.0, 0.0, 1.0], [30, 10, 21])
+    log = replace(log, channels={**log.channels, "enabled.arm": enabled}, meta=replace(log.meta, mount="free"))
+    law = BackEmf.at(("arm",), {"arm": SCALE})
+
+    def segment(log: Log, first: int) -> np.ndarray:
+        start, rows = np.array([[0.0, 0.0, 1.0]]), np.array([[first, first + 20]])
+        still, joint = np.zeros((1, 3)), np.full((1, 1), 0.5)
+        windows = Windows(rows, start, np.eye(1, 4), still, still, joint, 8 * joint, np.ones((1, 14)))
+        replay = WindowReplay(robot_from_xml(STANDING), log, (law,), FINE, windows=windows)
+        return replay.predict(np.full((1, 1), 0.5)).position[0, first : first + 20]
+
+    seen = segment(log, 22)
+    assert np.isfinite(seen).all()
+    np.testing.assert_allclose(seen, segment(log.window(22, 61), 0), atol=1e-12)
+    on = replace(log, channels={**log.channels, "enabled.arm": np.ones(61)})
+    assert np.abs(seen - segment(on, 22)).max() > 1e-3
 
 
 @pytest.mark.parametrize("law", [False, True])

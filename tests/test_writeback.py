@@ -628,6 +628,14 @@ def test_parameters_read_back_and_replay_the_same(fitted: Any, out: Folder) -> N
     assert {"name", "value", "unit", "std", "ci95", "nominal"} <= set(first)
 
 
+@pytest.mark.parametrize("numerics", [Numerics("RK4", 0.005, 0.01), Numerics("Euler", 0.004, None, "another")])
+def test_numerics_read_back_with_held_servos_and_simulator(own: Path, out: Folder, numerics: Numerics) -> None:
+    model = declared(own, ["kp:hip"], [1.1])
+    model = replace(model, study=replace(model.study, numerics=numerics))
+    out.write("params.json", json.dumps(params_of(model), default=list))
+    assert read_params(out.path, load_robot(str(own))).numerics == numerics
+
+
 def test_effects_read_back_too(own: Path, out: Folder) -> None:
     robot = load_robot(str(own))
     study = study_of(robot)
