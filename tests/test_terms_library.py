@@ -1,25 +1,28 @@
-"""What every effect must be: neutral by default, bounded, documented, and visible when it is large."""
+"""What every term must be: described, bounded, neutral by default, visible when it is large, written as it moves."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 import pytest
-from toys import FINE, LEG_JOINTS, SCALE, leg, make_log, position, robot_from_xml, run, swing
+from toys import LEG_JOINTS, SCALE, leg, position, swing
 
+from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.io.log import Log
-from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.library import effect_names, effects, select_effects
+from sysid_btr.terms.base import Kind, Term
+from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.library import all_terms, effect_names, select_effects
 from sysid_btr.terms.scales import Scales
 from sysid_btr.terms.transmission import JointCompliance
+from sysid_btr.testing import TERM_CHECKS, TermBench, check_term, toy_motion, toy_robot
 
 LOG = swing(LEG_JOINTS, seconds=0.8)
-EFFECTS = effects()
 SCALES: Scales = dict.fromkeys(LEG_JOINTS, SCALE)
-STRUCTURAL = 2e-4
-"""rad; a second joint that is held is nearly, not exactly, no joint."""
 
 NAMES = """
     coulomb_friction viscous_damping quadratic_damping stribeck_friction load_friction armature
@@ -28,63 +31,25 @@ NAMES = """
     com_offset constant_force cogging external_disturbance gravity_tilt foot_friction foot_compliance
 """
 
-SLIDER = """
-<mujoco><worldbody>
-  <geom name="floor" type="plane" size="5 5 .1"/>
-  <body name="box" pos="0 0 .05">
-    <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
-    <geom type="box" size=".05 .05 .05" mass="1"/></body>
-</worldbody></mujoco>
-"""
+
+@pytest.fixture(scope="module")
+def bench() -> TermBench:
+    return TermBench.of(toy_robot(), toy_motion())
 
 
-def sliding() -> tuple[Robot, Log]:
-    """A box that slides over the ground, and falls onto it first."""
-    n = 41
-    channels = {
-        "position.x": np.zeros(n),
-        "velocity.x": np.full(n, 3.0),
-        "position.z": np.full(n, 0.01),
-        "velocity.z": np.zeros(n),
-    }
-    return robot_from_xml(SLIDER), make_log(np.arange(n) * 0.005, channels)
+def label(cls: type[Term]) -> str:
+    return f"{cls.name}-{cls.variant}" if cls.variant else cls.name
 
 
-def label(effect: type[Effect]) -> str:
-    return f"{effect.name}-{effect.variant}" if effect.variant else effect.name
-
-
-def place(effect: type[Effect]) -> str:
-    return "robot" if effect.scope == "robot" else "knee"
-
-
-def at_knee(effect: type[Effect]) -> Effect:
-    return effect.at((place(effect),), SCALES)
-
-
-def realistic(effect: type[Effect]) -> np.ndarray:
-    """Values (kinds,) of a clear case of the effect."""
-    special: dict[str, tuple[float, ...]] = {
-        "cogging": (0.3, 0.2, 20.0),
-        "external_disturbance": (1.0, 0.3, 0.05),
-        "speed_torque_limit": (0.4, 5.0),
-        "thermal_derating": (2.0, 1.0),
-    }
-    if label(effect) == "voltage_sag-time":
-        return np.array([0.05])
-    if effect.variant in ("train", "drive_train"):
-        return np.array([1.0, 0.3, 0.05, 0.2])
-    if effect.name in special:
-        return np.array(special[effect.name])
-    return np.array(effect.probes(SCALE)[-1][-1])
-
-
-every_effect = pytest.mark.parametrize("effect", EFFECTS, ids=label)
+@pytest.mark.parametrize("check", TERM_CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("cls", all_terms(), ids=label)
+def test_conformance(cls: type[Term], check: Callable[[type[Term], TermBench], None], bench: TermBench) -> None:
+    check(cls, bench)
 
 
 def test_every_promised_effect_is_there() -> None:
     assert set(NAMES.split()) <= set(effect_names())
-    assert len({(e.name, e.variant) for e in EFFECTS}) == len(EFFECTS)
+    assert len({(t.name, t.variant) for t in all_terms()}) == len(all_terms())
 
 
 def test_effects_are_chosen_by_name_and_a_wrong_name_is_told() -> None:
@@ -99,43 +64,58 @@ def test_effects_are_chosen_by_name_and_a_wrong_name_is_told() -> None:
         select_effects(["backlsh"])
 
 
-@every_effect
-def test_an_effect_says_what_it_is(effect: type[Effect]) -> None:
-    assert effect.name
-    assert effect.title
-    assert effect.title[0].islower()
-    assert effect.__doc__
-    assert effect.needs
-    assert effect.confounders, "what else leaves such a trace, and what tells the two apart"
-    assert 0 <= effect.main < len(effect.kinds)
-    assert set(effect.held) <= {k.name for k in effect.kinds}
+@dataclass(frozen=True)
+class NotNeutral(CoulombFriction):
+    """Half of what is asked for, and a little more.
+
+    Native: `dof_frictionloss`.
+    """
+
+    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
+        return present + values + 0.01
 
 
-@every_effect
-def test_bounds_hold_the_neutral_value(effect: type[Effect]) -> None:
-    for parameter in at_knee(effect).parameters:
-        assert parameter.lower <= parameter.nominal <= parameter.upper
-        assert 0 < parameter.scale < parameter.upper - parameter.lower
-        assert np.isfinite([parameter.lower, parameter.upper]).all()
-        assert parameter.unit
+@dataclass(frozen=True)
+class Idle(CoulombFriction):
+    """Nothing at all."""
+
+    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
+        return present
 
 
-@every_effect
-def test_probes_are_legal_values_other_than_neutral(effect: type[Effect]) -> None:
-    kinds = effect.sized(SCALE)
-    for probe in effect.probes(SCALE):
-        for values in probe:
-            assert len(values) == len(kinds)
-            assert any(v != k.nominal for v, k in zip(values, kinds, strict=True))
-            assert all(k.lower <= v <= k.upper for v, k in zip(values, kinds, strict=True))
+@dataclass(frozen=True)
+class Neighbourly(CoulombFriction):
+    """The mean over all candidates."""
+
+    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
+        return present + values.mean()
 
 
-@every_effect
-def test_a_neutral_effect_is_no_effect(effect: type[Effect]) -> None:
-    numerics = Numerics("RK4", 0.00125) if effect.name == "joint_compliance" else FINE
-    neutral = position(leg(), LOG, [at_knee(effect)], numerics=numerics)
-    tolerance = STRUCTURAL if effect.structural else 1e-12
-    np.testing.assert_allclose(neutral, position(leg(), LOG, numerics=numerics), rtol=0, atol=tolerance)
+@dataclass(frozen=True)
+class Undescribed(CoulombFriction):
+    """A change of a unit that is none."""
+
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "furlong", 0.0, 0.0, 10.0, 0.05),)
+
+
+@pytest.mark.parametrize(
+    ("cls", "promise"),
+    [
+        (NotNeutral, "its neutral value changes the plain model"),
+        (Idle, "changes nothing"),
+        (Neighbourly, "moves otherwise beside another candidate|neutral value changes"),
+        (Undescribed, "'furlong' is not a unit"),
+    ],
+)
+def test_a_broken_term_is_caught(cls: type[Term], promise: str) -> None:
+    with pytest.raises(AssertionError, match=promise):
+        check_term(cls)
+
+
+def test_an_encoder_in_the_loop_of_a_joint_without_a_servo_leaves_the_servos_alone(bench: TermBench) -> None:
+    (term,) = parse_parameters(["encoder_scale.loop:slide"], bench.study.robot)
+    plain, wrong = bench.predict(term, np.zeros(1), np.full(1, 0.2))
+    np.testing.assert_array_equal(wrong[:, :2], plain[:, :2])
 
 
 def test_the_stiffest_gear_gets_stiffer_with_a_finer_step() -> None:
@@ -145,38 +125,9 @@ def test_the_stiffest_gear_gets_stiffer_with_a_finer_step() -> None:
         numerics = Numerics("RK4", step)
         rigid = position(leg(), LOG, numerics=numerics)
         return float(
-            np.abs(position(leg(), LOG, [at_knee(JointCompliance)], numerics=numerics) - rigid).max()
+            np.abs(position(leg(), LOG, [JointCompliance.at(("knee",), SCALES)], numerics=numerics) - rigid).max()
         )
 
     coarse, fine = twist(0.005), twist(0.00125)
     assert coarse < 5e-3
     assert fine < coarse / 10
-
-
-@every_effect
-def test_a_neutral_candidate_is_not_disturbed_by_its_neighbours(effect: type[Effect]) -> None:
-    term = at_knee(effect)
-    together = run(leg(), LOG, [term], np.stack([term.neutral, realistic(effect)]))
-    alone = run(leg(), LOG, [term], term.neutral)
-    np.testing.assert_array_equal(together.position[0], alone.position[0])
-
-
-@every_effect
-def test_a_realistic_effect_changes_the_replay(effect: type[Effect]) -> None:
-    robot, log = sliding() if effect.name.startswith("foot_") else (leg(), LOG)
-    term = at_knee(effect)
-    outputs = run(robot, log, [term], np.stack([term.neutral, realistic(effect)]))
-    assert np.isfinite(outputs.position).all()
-    assert np.abs(outputs.position[1] - outputs.position[0]).max() > 1e-4
-
-
-@pytest.mark.parametrize("effect", [e for e in EFFECTS if e.scope != "robot"], ids=label)
-def test_one_shared_amount_equals_the_same_amount_everywhere(effect: type[Effect]) -> None:
-    places = ("hip", "knee")
-    values = realistic(effect)
-    shared = effect.at(places, SCALES, shared=True)
-    apart = effect.at(places, SCALES)
-    assert len(apart.parameters) == 2 * len(shared.parameters)
-    np.testing.assert_allclose(
-        position(leg(), LOG, [shared], values), position(leg(), LOG, [apart], np.tile(values, 2)), atol=1e-12
-    )

@@ -22,7 +22,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.effect import GROUND, Effect
 from sysid_btr.terms.library import select_effects
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[
     free = any(episode.log.meta.mount == "free" for episode in study.train)
     result = []
     for effect in effects:
-        if effect.name.startswith("foot_") and not free:
+        if effect.needs == GROUND and not free:
             continue
         if effect.needs == "enabled" and not any(_switched(episode.log) for episode in study.train):
             continue

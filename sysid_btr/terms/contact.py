@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope
-from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.effect import GROUND, Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class FootFriction(Effect):
     title: ClassVar[str] = "change of the ground's friction"
     scope: ClassVar[Scope] = "robot"
     declared_at: ClassVar[Scope | None] = "body"
-    needs: ClassVar[str] = "a free base on the ground"
+    needs: ClassVar[str] = GROUND
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("factor", "1", 1.0, 0.1, 3.0, 0.1),)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("gravity_tilt", "motion in several directions"),)
@@ -81,7 +81,7 @@ class FootCompliance(Effect):
     title: ClassVar[str] = "change of the ground's softness"
     scope: ClassVar[Scope] = "robot"
     declared_at: ClassVar[Scope | None] = "body"
-    needs: ClassVar[str] = "a free base on the ground"
+    needs: ClassVar[str] = GROUND
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("factor", "1", 1.0, 0.2, 10.0, 0.1),)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("joint_compliance", "motion in the air"),)

@@ -17,7 +17,7 @@ from sysid_btr.terms.scales import JointScale
 class ConstantForce(Effect):
     """A constant torque on a joint: asymmetric friction, a drive's offset, a pulling cable.
 
-    Applied to the joint, beside the servo.
+    Torque: on the joint, beside the servo.
     """
 
     name: ClassVar[str] = "constant_force"
@@ -44,7 +44,7 @@ class ConstantForce(Effect):
 class ExternalDisturbance(Effect):
     """Pushes from outside: a torque on a joint between two moments, once or again and again.
 
-    A rectangular pulse, exact in the mean over each step.
+    Torque: a rectangular pulse, exact in the mean over each step.
     """
 
     name: ClassVar[str] = "external_disturbance"
@@ -91,7 +91,10 @@ class ExternalDisturbance(Effect):
 
 @dataclass(frozen=True)
 class ExternalDisturbanceTrain(Effect):
-    """The same push again and again, exact in the mean over each step."""
+    """The same push again and again.
+
+    Torque: rectangular pulses, exact in the mean over each step.
+    """
 
     name: ClassVar[str] = "external_disturbance"
     variant: ClassVar[str] = "train"
@@ -134,7 +137,7 @@ class ExternalDisturbanceTrain(Effect):
 class DriveDisturbanceTrain(ExternalDisturbanceTrain):
     """Pulses added to the drive's input: the logged effort holds them, and the drive's limit clips them.
 
-    A position servo feels them as an offset of its command by torque / kp, and that is how they enter.
+    Command: a position servo feels them as an offset of its command by torque / kp, and that is how they enter.
     """
 
     variant: ClassVar[str] = "drive_train"

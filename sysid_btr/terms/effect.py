@@ -20,6 +20,9 @@ LADDER = (0.3, 0.55, 1.0, 1.8, 3.0, 5.0)
 THRESHOLDS = (0.6, 0.72, 0.85, 1.0, 1.15, 1.3, 1.5)
 """The same for a limit, which does nothing a little too high."""
 
+GROUND = "a free base on the ground"
+"""What an effect `needs` that a robot on a fixed base cannot show."""
+
 Probe = tuple[tuple[float, ...], ...]
 """Values (one tuple a direction) whose responses span an effect linearly at one working point."""
 

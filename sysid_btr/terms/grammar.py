@@ -92,8 +92,8 @@ def _parse_one(
             )
         names += [n for n in matched if n not in names]
     if option == "shared":
-        return [_build(bare, tuple(names), robot, scales, globs)]
-    return [_build(bare, group, robot, scales, ",".join(group)) for group in _motors(bare.location, names, robot)]
+        return [make_term(bare, tuple(names), robot, scales, globs)]
+    return [make_term(bare, group, robot, scales, ",".join(group)) for group in _motors(bare.location, names, robot)]
 
 
 ALSO_CALLED = {"friction": "frictionloss", "spring": "stiffness", "p": "kp", "d": "kv", "kd": "kv", "gain": "kp"}
@@ -149,7 +149,7 @@ def _motors(scope: Scope, names: list[str], robot: Robot) -> list[tuple[str, ...
     return groups
 
 
-def _build(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales | None, label: str) -> Term:
+def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales | None, label: str) -> Term:
     """The term at some places, which share its numbers; `label` is what they are called by together."""
     kinds = bare.kinds if scales is None else bare.sized(largest_scale(scales, places))
     fixed = tuple(None if v is None else k.nominal for k, v in zip(kinds, bare.fixed, strict=False))

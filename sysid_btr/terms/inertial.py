@@ -29,7 +29,10 @@ def allow_any_inertia(spec: mujoco.MjSpec, places: tuple[str, ...]) -> None:
 
 @dataclass(frozen=True)
 class Mass(Effect):
-    """Mass of a body as a factor of the nominal; the inertia follows."""
+    """Mass of a body as a factor of the nominal; the inertia follows.
+
+    Native: `body_mass` and `body_inertia`.
+    """
 
     name: ClassVar[str] = "mass"
     title: ClassVar[str] = "change of the mass"
@@ -51,7 +54,10 @@ class Mass(Effect):
 
 @dataclass(frozen=True)
 class Inertia(Effect):
-    """Rotational inertia of a body about its centre of mass, as a factor; the mass stays."""
+    """Rotational inertia of a body about its centre of mass, as a factor; the mass stays.
+
+    Native: `body_inertia`.
+    """
 
     name: ClassVar[str] = "inertia"
     title: ClassVar[str] = "change of the inertia"
@@ -117,7 +123,7 @@ class Payload(Effect):
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("mass", "kg", 0.0, 0.0, 2.0, 0.05),
         *(Kind(axis, "m", 0.0, -0.3, 0.3, 0.02) for axis in "xyz"),
-        Kind("inertia", "kg m^2", 0.0, 0.0, 0.01, 2e-5),
+        Kind("inertia", "kg m2", 0.0, 0.0, 0.01, 2e-5),
     )
     details: ClassVar[tuple[str, ...]] = ("inertia",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (

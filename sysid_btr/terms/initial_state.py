@@ -11,7 +11,10 @@ from sysid_btr.terms.base import BatchModel, Kind, Term
 
 @dataclass(frozen=True)
 class StartPosition(Term):
-    """Correction of the position at which the replay starts."""
+    """Correction of the position at which the replay starts.
+
+    Start: the log's first position plus this.
+    """
 
     name: ClassVar[str] = "qpos0"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("offset", "rad", 0.0, -0.1, 0.1, 0.002),)
@@ -22,7 +25,10 @@ class StartPosition(Term):
 
 @dataclass(frozen=True)
 class StartVelocity(Term):
-    """Correction of the velocity at which the replay starts."""
+    """Correction of the velocity at which the replay starts.
+
+    Start: the log's first velocity plus this.
+    """
 
     name: ClassVar[str] = "qvel0"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("offset", "rad/s", 0.0, -5.0, 5.0, 0.05),)

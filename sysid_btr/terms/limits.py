@@ -115,7 +115,7 @@ class SpeedTorqueLimit(Effect):
 class SlewLimit(Effect):
     """A servo that follows its command no faster than a certain rate.
 
-    The command is rate-limited before the replay; neutral above every rate of the log.
+    Command: limited in its rate before the replay; neutral above every rate of the log.
     """
 
     name: ClassVar[str] = "slew_limit"

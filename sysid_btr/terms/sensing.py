@@ -18,7 +18,7 @@ from sysid_btr.terms.scales import JointScale
 class EncoderOffset(Effect):
     """An encoder whose zero is off, either the logged one alone or the one that closes the servo loop too.
 
-    The log shows q + b; the servo uses the true q.
+    Sensor: the log shows q + b; the servo uses the true q.
     """
 
     name: ClassVar[str] = "encoder_offset"
@@ -42,7 +42,11 @@ class EncoderOffset(Effect):
 
 @dataclass(frozen=True)
 class EncoderOffsetInLoop(EncoderOffset):
-    """The log shows q + b, and the servo closes its loop on it: seen through gravity only."""
+    """The servo closes its loop on what the log shows, which is seen through gravity only.
+
+    Command: less by b, as an error of q + b is one of the command by -b.
+    Start: the log's first position, less b.
+    """
 
     variant: ClassVar[str] = "loop"
 
@@ -59,7 +63,7 @@ class EncoderOffsetInLoop(EncoderOffset):
 class EncoderScale(Effect):
     """An encoder whose scale is off, either the logged one alone or the one that closes the servo loop too.
 
-    The log shows (1 + e) q; the servo uses the true q.
+    Sensor: the log shows (1 + e) q; the servo uses the true q.
     """
 
     name: ClassVar[str] = "encoder_scale"
@@ -80,14 +84,18 @@ class EncoderScale(Effect):
 
 @dataclass(frozen=True)
 class EncoderScaleInLoop(EncoderScale):
-    """The log shows (1 + e) q, and the servo closes its loop on it."""
+    """The servo closes its loop on what the log shows.
+
+    Native: the second and third of `actuator_biasprm`.
+    Start: the log's first position and velocity, over 1 + e.
+    """
 
     variant: ClassVar[str] = "loop"
 
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
         ids = batch.index.actuator[batch.index.of(self.places)]
-        bias = batch.read("actuator_biasprm")
-        bias[:, ids, 1:3] *= 1 + values[:, :, :1]
+        bias, driven = batch.read("actuator_biasprm"), ids >= 0
+        bias[:, ids[driven], 1:3] *= 1 + values[:, driven, :1]
         return {"actuator_biasprm": bias}
 
     def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
@@ -100,7 +108,7 @@ class EncoderScaleInLoop(EncoderScale):
 class SensorDelay(Effect):
     """Delay between a joint's position and the log of it.
 
-    Predicted positions and velocities are read earlier, by cubic interpolation.
+    Sensor: predicted positions and velocities are read earlier, by cubic interpolation.
     """
 
     name: ClassVar[str] = "sensor_delay"

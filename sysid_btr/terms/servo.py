@@ -21,7 +21,10 @@ def servos(batch: BatchModel, places: tuple[str, ...]) -> IntArray:
 
 @dataclass(frozen=True)
 class Kp(Effect):
-    """Proportional gain of a position servo, as a factor."""
+    """Proportional gain of a position servo, as a factor.
+
+    Native: the first of `actuator_gainprm`, the second of `actuator_biasprm`.
+    """
 
     name: ClassVar[str] = "kp"
     title: ClassVar[str] = "change of the servo's stiffness"
@@ -44,7 +47,10 @@ class Kp(Effect):
 
 @dataclass(frozen=True)
 class Kv(Effect):
-    """Derivative gain of a position servo, as a factor."""
+    """Derivative gain of a position servo, as a factor.
+
+    Native: the third of `actuator_biasprm`.
+    """
 
     name: ClassVar[str] = "kv"
     title: ClassVar[str] = "change of the servo's damping"
@@ -64,7 +70,10 @@ class Kv(Effect):
 
 @dataclass(frozen=True)
 class TorqueConstant(Effect):
-    """Torque that a servo makes, its gains and its limits alike, as a factor: motor constant over resistance."""
+    """Torque that a servo makes, its gains and its limits alike, as a factor: motor constant over resistance.
+
+    Native: `actuator_gainprm`, `actuator_biasprm` and `actuator_forcerange`.
+    """
 
     name: ClassVar[str] = "torque_constant"
     title: ClassVar[str] = "change of the servo's torque"
@@ -159,7 +168,7 @@ class BackEmf(Effect):
 class CommandDelay(Effect):
     """Delay between the logged command and the servo that obeys it.
 
-    Held commands are shifted before the replay, exactly, by any fraction of a step.
+    Command: shifted before the replay, exactly, by any fraction of a step.
     """
 
     name: ClassVar[str] = "command_delay"

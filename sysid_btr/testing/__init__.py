@@ -36,13 +36,16 @@ from sysid_btr.testing.problems import (
 )
 from sysid_btr.testing.require import require
 from sysid_btr.testing.simulator import SIMULATOR_CHECKS, check_simulator
+from sysid_btr.testing.term import TERM_CHECKS, TermBench, check_term, toy_motion, toy_robot
 
 __all__ = [
     "ESTIMATOR_CHECKS",
     "IMPORTER_CHECKS",
     "SIMULATOR_CHECKS",
+    "TERM_CHECKS",
     "Killed",
     "LossOnly",
+    "TermBench",
     "ToyProblem",
     "Witness",
     "bound_active",
@@ -58,6 +61,7 @@ __all__ = [
     "check_result",
     "check_resume",
     "check_simulator",
+    "check_term",
     "exponential_decay",
     "failing_region",
     "hopeless",
@@ -67,4 +71,6 @@ __all__ = [
     "require",
     "rosenbrock",
     "run",
+    "toy_motion",
+    "toy_robot",
 ]

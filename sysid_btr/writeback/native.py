@@ -52,17 +52,26 @@ class Part:
     how: str
 
 
-def part_of(term: Term, values: FloatArray, numerics: Numerics, later: tuple[Term, ...]) -> Part:
-    """How a file holds one term.
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What decides how a file can hold a term.
 
-    Parameters
+    Attributes
     ----------
-    term, values : as replayed.
+    plain : the robot without any term.
     numerics : integrator and step of the file.
-    later : terms that act after it.
+    later : terms that act after this one.
     """
+
+    plain: mujoco.MjModel
+    numerics: Numerics
+    later: tuple[Term, ...]
+
+
+def part_of(term: Term, values: FloatArray, beside: Beside) -> Part:
+    """How a file holds one term, given its values (1, places, kinds)."""
     native = NATIVE.get(type(term))
-    found = None if native is None else native(term, values[0], numerics, later)
+    found = None if native is None else native(term, values[0], beside)
     if found is not None:
         stand_in, held, how = found
         return Part(term, values, stand_in, held, how)
@@ -102,9 +111,13 @@ class AddedBody(Term):
         return {"body_mass": masses, "body_inertia": inertias} if loaded else {}
 
 
-def _payload(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
-    if any(set(term.places) & set(m.places) and m.scope == "body" for m in later):
+def _payload(term: Term, values: FloatArray, beside: Beside) -> Found:
+    if any(set(term.places) & set(m.places) and m.scope == "body" for m in beside.later):
         return None  # what follows changes body and load together
+    plain = beside.plain
+    touching = {plain.body(int(b)).name for b in plain.geom_bodyid[(plain.geom_contype | plain.geom_conaffinity) != 0]}
+    if touching & set(term.places):
+        return None  # MuJoCo's contacts are as stiff as the body that touches is heavy at its own centre of mass
     loads = tuple(tuple(float(x) for x in row) for row in values)
     return AddedBody(places=term.places, loads=loads), "yes", "a body of its own"
 
@@ -136,8 +149,9 @@ class ActuatorDelay(Term):
                     actuator.interp = 1
 
 
-def _delay(term: Term, values: FloatArray, numerics: Numerics, later: tuple[Term, ...]) -> Found:
-    if any(_reshapes(m) and set(m.places) & set(term.places) for m in later):
+def _delay(term: Term, values: FloatArray, beside: Beside) -> Found:
+    numerics = beside.numerics
+    if any(_reshapes(m) and set(m.places) & set(term.places) for m in beside.later):
         return None
     stated = [_buffered(float(d), numerics) for d in values[:, 0]]
     if not any(delay for delay, _ in stated):
@@ -190,8 +204,8 @@ class SoftSpring(Term):
         return {"jnt_stiffness": stiffness, "qpos_spring": rest}
 
 
-def _constant(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
-    if any(m.name == "joint_spring" for m in later):
+def _constant(term: Term, values: FloatArray, beside: Beside) -> Found:
+    if any(m.name == "joint_spring" for m in beside.later):
         return None
     torques = tuple(float(t) for t in values[:, 0])
     how = "a spring on the joint, so soft and so long that its torque is constant"
@@ -218,14 +232,14 @@ class ShiftedJoint(Term):
         return {"qpos0": zero, "qpos_spring": rest, "jnt_range": limits}
 
 
-def _reference(term: Term, values: FloatArray, _: Numerics, later: tuple[Term, ...]) -> Found:
-    if any(m.name in ("joint_spring", "encoder_scale") for m in later):
+def _reference(term: Term, values: FloatArray, beside: Beside) -> Found:
+    if any(m.name in ("joint_spring", "encoder_scale") for m in beside.later):
         return None
     offsets = tuple(float(b) for b in values[:, 0])
     return ShiftedJoint(places=term.places, offsets=offsets), "yes", "the joint's reference angle"
 
 
-Native = Callable[["Term", FloatArray, "Numerics", "tuple[Term, ...]"], Found]
+Native = Callable[["Term", FloatArray, Beside], Found]
 NATIVE: Mapping[type[Term], Native] = {
     Payload: _payload,
     CommandDelay: _delay,

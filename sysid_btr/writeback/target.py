@@ -17,7 +17,7 @@ from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import BatchModel
 from sysid_btr.terms.model import Model
 from sysid_btr.writeback.features import WRITTEN
-from sysid_btr.writeback.native import Part, part_of
+from sysid_btr.writeback.native import Beside, Part, part_of
 
 if TYPE_CHECKING:
     import mujoco
@@ -44,12 +44,12 @@ class Target:
 def make_parts(robot: Robot, model: Model, numerics: Numerics) -> tuple[Part, ...]:
     """How a file holds each term that is not neutral; those of the robot itself come first."""
     everything = Model.joined([*((term, ()) for term in robot.always), *model.parts])
-    parts = []
+    parts, plain = [], robot.compile()
     for i, (term, own) in enumerate(everything.parts):
         neutral = len(own) > 0 and np.array_equal(own, [p.nominal for p in term.parameters])
         if neutral and not type(term).overrides("edit_spec"):
             continue
-        parts.append(part_of(term, term.spread(own[None]), numerics, everything.terms[i + 1 :]))
+        parts.append(part_of(term, term.spread(own[None]), Beside(plain, numerics, everything.terms[i + 1 :])))
     return tuple(parts)
 
 
