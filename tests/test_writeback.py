@@ -190,9 +190,9 @@ def changed_fields(a: mujoco.MjModel, b: mujoco.MjModel, tolerance: float = 1e-1
 DERIVED = {
     "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length", "tendon_invweight0",
     "actuator_acc0", "cam_pos0", "cam_poscom0", "light_poscom0", "body_sameframe", "geom_sameframe", "D_diag",
-    "dof_solref", "dof_solimp", "efm0_L", "bvh_aabb",
+    "dof_solref", "dof_solimp", "efm0_L", "bvh_aabb", "bvh_nodeid", "bvh_child", "bvh_depth",
 }  # fmt: skip
-"""What follows from other fields, or counts only with friction."""
+"""What follows from other fields (bounding volumes lie in the frame of the inertia), or counts only with friction."""
 OPTIONS = {"opt.timestep", "opt.integrator"}
 
 
