@@ -91,6 +91,24 @@ def test_damage_in_the_middle_is_reported_and_nothing_lost(tmp_path: Path) -> No
     assert path.read_bytes() == damaged
 
 
+def test_numbers_that_were_changed_in_a_record_are_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "fit.journal"
+    journal = Journal(path)
+    for value in (1.5, 2.5):
+        journal.append(_record(value))
+    path.write_bytes(path.read_bytes().replace(b"1.5", b"0.0", 1))
+    with pytest.raises(UsageError, match="line 2: damaged"):
+        Journal(path)
+
+
+def test_an_attachment_that_was_changed_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "fit.journal"
+    Journal(path).append(_record(1.0), np.ones((3, 2)))
+    np.save(tmp_path / "fit.journal.0.npy", np.zeros((3, 2)))
+    with pytest.raises(UsageError, match="not what was written"):
+        Journal(path).attachment(0)
+
+
 def test_another_fits_journal_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.journal"
     _write(path, fingerprint="theirs")

@@ -14,15 +14,16 @@ import re
 import time
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 
-SCHEMA = "sysid_btr.journal/1"
+SCHEMA = "sysid_btr.journal/2"
 _SYNC_PERIOD = 1.0  # s; a power cut loses at most the evaluations of this time
 
 
@@ -40,32 +41,41 @@ class Record:
         What the estimator needs to know of the outcome; ``loss``, shape ``(m,)``, always.
     seconds
         Wall time spent on the fit up to this record.
+    attached
+        CRC-32 of the attachment that came with it; None without one.
     """
 
     kind: str
     candidates: FloatArray
     arrays: Mapping[str, FloatArray]
     seconds: float
+    attached: int | None = None
 
     def to_line(self) -> bytes:
-        """One line of JSON; floats as the shortest text that reads back to the same bits."""
+        """One line of JSON and its CRC-32; floats as the shortest text that reads back to the same bits."""
         content = {
             "kind": self.kind,
             "seconds": self.seconds,
             "candidates": self.candidates.tolist(),
             "arrays": {name: values.tolist() for name, values in self.arrays.items()},
+            "attached": self.attached,
         }
-        return json.dumps(content).encode() + b"\n"
+        text = json.dumps(content).encode()
+        return b"%s %08x\n" % (text, crc32(text))
 
     @classmethod
     def from_line(cls, line: bytes) -> Record:
         """Read a line; raises ValueError, KeyError or TypeError if it is damaged."""
-        content = json.loads(line)
+        text, _, checksum = line.rpartition(b" ")
+        if crc32(text) != int(checksum, 16):
+            raise ValueError("the checksum is that of another text")
+        content = json.loads(text)
         return cls(
             kind=str(content["kind"]),
             candidates=np.array(content["candidates"], dtype=np.float64),
             arrays={name: np.array(v, dtype=np.float64) for name, v in content["arrays"].items()},
             seconds=float(content["seconds"]),
+            attached=content["attached"],
         )
 
 
@@ -185,6 +195,7 @@ class Journal:
             if attachment is not None:
                 # Written before its record: a record on disk never lacks its attachment.
                 self._save_attachment(number, attachment)
+                record = replace(record, attached=crc32(attachment.tobytes()))
             self._write(record.to_line(), sync=attachment is not None)
             if attachment is not None:
                 self._drop_older_attachments(number)
@@ -210,6 +221,8 @@ class Journal:
             if self.path is None:
                 raise FileNotFoundError("it was replaced by a later one")
             values: FloatArray = np.load(self._attachment_path(self.path, number), allow_pickle=False)
+            if crc32(values.tobytes()) != self._tape.records[number].attached:
+                raise ValueError("it is not what was written")
         except (OSError, ValueError) as error:
             raise UsageError(
                 f"{self._label}: the array that belongs to record {number + 1} cannot be read ({error}). "
