@@ -35,6 +35,7 @@ from sysid_btr.terms.sensing import EncoderOffset, SensorDelay
 from sysid_btr.terms.servo import CommandDelay, IntegralGain
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.terms.transmission import Backlash, JointCompliance
+from sysid_btr.writeback.write import identified
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 GAINS = ("kp:*=shared", "kv:*=shared")
@@ -124,6 +125,10 @@ def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:
     assert found.verdict == "unexplained", found.message
     assert found.effects == ()
     assert found.signature is not None
+    # what is reported is what is written
+    written = identified(found).written
+    assert {p.name: p.value for p in found.parameters} == dict(zip(written.terms.names, written.values, strict=True))
+    assert found.after == found.before
 
 
 @pytest.mark.parametrize(

@@ -696,7 +696,7 @@ def test_effects_that_were_not_named_are_not_written(fitted: Any) -> None:
         nominal=fitted.nominal,
         before=fitted.before,
         after=fitted.before,
-        parameters=tuple(replace(e, value=e.value + 0.01) for e in fitted.estimates),
+        parameters=fitted.estimates,
         effects=(),
         candidates=(),
         steps=(),

@@ -78,13 +78,14 @@ class Closing:
     study : as diagnosed; its numerics may have been refined.
     verdict, message : the finding, and one sentence on it.
     noise_floor : by channel, SI.
-    nominal, before, after : scores of the plain model, with declared parameters, with effects.
-    parameters : declared parameters in the final model.
+    nominal, before, after : scores of the plain model, with declared parameters, with the effects that are named.
+    parameters : declared parameters beside the effects that are named.
     effects : what was missing.
     candidates : what was weighed, best first.
     steps : every step of the way.
     signature : of the residual that is left, when unexplained or where effects that are named leave much of it.
-    before_model, model : with the declared parameters fitted, and with what was missing.
+    before_model, model : with the declared parameters fitted, and with what was missing; where nothing is named, with
+        what comes nearest.
     replays, seconds : cost.
     """
 

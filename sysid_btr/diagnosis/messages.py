@@ -50,25 +50,26 @@ def message_of(
     verdict: Verdict,
     effects: Sequence[NamedEffect],
     before: Scores,
-    after: Scores,
+    nearest: Scores,
     left: Mapping[str, Any] | None,
     channel: str = "position",
     unit: str = "rad",
 ) -> str:
-    """The verdict in one sentence, with the held-out error before and after; `effects` are the best there are."""
+    """The verdict in one sentence, with the held-out error; `effects` are the best there are, `nearest` with them."""
     errors = ""
-    if channel in before.holdout and channel in after.holdout:
+    if channel in before.holdout and channel in nearest.holdout:
         old, new, floor = si_all(
-            [before.holdout[channel].rmse, after.holdout[channel].rmse, before.holdout[channel].floor], unit
+            [before.holdout[channel].rmse, nearest.holdout[channel].rmse, before.holdout[channel].floor], unit
         )
-        errors = f" Held-out {channel} error {old} -> {new} (noise floor {floor})."
+        change = f"{old} -> {new}" if verdict in ("explained", "ambiguous") else old
+        errors = f" Held-out {channel} error {change} (noise floor {floor})."
     if verdict == "nothing_missing":
         return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
     if verdict == "unexplained":
         hint = "" if not left else f" The residual is {left.get('summary', 'not characterised')}."
         if effects:
             listing = ", ".join(f"{e.effect} at {_places(e.where)}" for e in effects)
-            rest = _left(before, after, channel)
+            rest = _left(before, nearest, channel)
             hint = f" The nearest, {listing}, leaves {rest} (squared), too much to be named.{hint}"
         return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
     if left:

@@ -41,18 +41,20 @@ def conclude(state: State, verdict: Verdict, rules: Selection, seconds: float) -
     reported = state.reported
     if reported is None:
         reported = judge(study, first.model) if study.procedure.fuses else state.fitted
-    after = score(study, reported.model)
+    nearest = score(study, reported.model)
+    # what is reported and written is one state: without a named effect, that of the fit
+    after, estimates = (nearest, state.estimates) if kept else (first.before, first.estimates)
     channel = study.leading_channel
     unit = channel_units(study.robot)[channel].partition(",")[0]
     return Closing(
-        study=study,
+        study=study if kept else first.study,
         verdict=verdict,
-        message=message_of(verdict, named, first.before, after, left, channel, unit),
+        message=message_of(verdict, named, first.before, nearest, left, channel, unit),
         noise_floor={c: s.floor for c, s in first.before.holdout.items()},
         nominal=first.nominal,
         before=first.before,
         after=after,
-        parameters=state.estimates[: len(first.model.values)],
+        parameters=estimates[: len(first.model.values)],
         effects=kept,
         candidates=tuple(sorted(state.candidates, key=lambda c: -c.explained)),
         steps=state.steps,

@@ -80,8 +80,7 @@ def identified(outcome: Fit | Closing) -> Identified:
         model = outcome.model
         estimates = (*outcome.parameters, *(p for e in outcome.effects for p in e.parameters))
     else:
-        model = outcome.before_model
-        estimates = tuple(replace(e, value=float(v)) for e, v in zip(outcome.parameters, model.values, strict=True))
+        model, estimates = outcome.before_model, outcome.parameters
     held_back = tuple(
         e.name
         for term in model.terms
