@@ -76,7 +76,7 @@ def known_model(wanted: str | Robot | None) -> KnownModel | None:
     from sysid_btr.mujoco_conventions import slides
 
     robot = load_robot(wanted) if isinstance(wanted, str) else wanted
-    model = robot.compile()
+    model = robot.model
     joints = joint_names(robot)
     sliding = tuple(joint for joint in joints if slides(model, joint))
     return KnownModel(robot.name, joints, joint_ranges(robot), sliding)

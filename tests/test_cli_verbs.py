@@ -337,6 +337,22 @@ def test_close_names_the_effect_and_resumes(cli: Cli, bench: Path, tmp_path: Pat
     assert json.loads(again.out)["effects"] == result["effects"]
 
 
+def test_a_journal_is_not_continued_with_a_model_whose_included_file_changed(
+    cli: Cli, bench: Path, tmp_path: Path
+) -> None:
+    whole = (bench / "arm.xml").read_text()
+    head, _, body = whole.partition("<worldbody>")
+    (tmp_path / "arm.xml").write_text(f'{head}<include file="bodies.xml"/></mujoco>')
+    (tmp_path / "bodies.xml").write_text(f"<mujoco><worldbody>{body}")
+    asked = ("fit", "--model", tmp_path / "arm.xml", "--log", bench / "arm.parquet", "--fit", "kp:*")
+    assert cli(*asked, "--out", tmp_path / "out").code == 0
+    assert cli(*asked, "--out", tmp_path / "out", "--resume").code == 0
+    (tmp_path / "bodies.xml").write_text(f"<mujoco><worldbody>{body}".replace('mass="', 'mass="1'))
+    answer = cli(*asked, "--out", tmp_path / "out", "--resume")
+    assert answer.code == 2
+    assert "belongs to another fit" in answer.err
+
+
 def test_the_same_recording_counts_once_whatever_it_is_called(cli: Cli, bench: Path, tmp_path: Path) -> None:
     asked = ("fit", "--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--fit", "kp:*")
     log = read_log(bench / "arm.parquet")

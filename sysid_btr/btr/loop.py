@@ -134,7 +134,7 @@ class _Loop:
         settings = replace(self.settings, iterations=1, requirement=None)
         parameters = [(p.name, p.nominal, p.lower, p.upper) for p in self.stage.parameters]
         bounds = [self.space.lower.tolist(), self.space.upper.tolist(), self.space.start.tolist()]
-        content = [__version__, self.model.digest, parameters, bounds, repr(self.task), repr(settings), self.seed]
+        content = [__version__, self.model.fingerprint, parameters, bounds, repr(self.task), repr(settings), self.seed]
         content.append(self.fingerprint)
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 

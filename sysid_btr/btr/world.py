@@ -157,7 +157,7 @@ def make_world(
     halvings : times the step is halved below the one that the model states (at most `STEP`).
     threads : worker threads, 0 for all cores.
     """
-    own = float(robot.compile().opt.timestep)
+    own = float(robot.model.opt.timestep)
     step = task.period / np.ceil(task.period / min(own, STEP) - 1e-9) / 2**halvings
     log = Log(
         time=task.time,

@@ -67,7 +67,7 @@ def fingerprint(verb: str, options: OutOptions, robot: Robot) -> str:
     import hashlib
     import json
 
-    content = {"version": __version__, "verb": verb, **deciding(options), "model": robot.digest}
+    content = {"version": __version__, "verb": verb, **deciding(options), "model": robot.fingerprint}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

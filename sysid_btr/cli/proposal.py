@@ -77,7 +77,7 @@ def study_file(robot: Robot, logs: Sequence[Log], model: str, out: Path | None =
     ModelError
         If no joint of the model has a position in the logs.
     """
-    compiled = robot.compile()
+    compiled = robot.model
     seen = [_joints_seen(log, robot, compiled) for log in logs]
     if not any(seen):
         there = ", ".join(dict.fromkeys(j for log in logs for j in log.joints("position"))) or "none"

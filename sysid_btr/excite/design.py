@@ -107,7 +107,7 @@ def find_sensors(robot: Robot, reference: Log | None = None, noise: float | None
         raise UsageError(f"--noise {noise:g}: the standard deviation of a position sensor must be positive")
     joints = joint_names(robot)
     if reference is None:
-        if noise is None and any(slides(robot.compile(), j) for j in joints):
+        if noise is None and any(slides(robot.model, j) for j in joints):
             raise UsageError(
                 f"model {robot.name} has sliding joints, and the noise of their sensors is unknown: give --log, or "
                 "--noise in m"

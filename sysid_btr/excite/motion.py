@@ -251,7 +251,7 @@ def find_motors(
     motion = motion or MotionSettings()
     if not 0 <= motion.margin < 0.5:
         raise UsageError(f"--margin {motion.margin:g}: a fraction of each joint's range, 0 to less than 0.5")
-    model = robot.compile()
+    model = robot.model
     known = servo_joints(robot)
     if not known:
         raise ModelError(f"model {robot.name} has no position servo, so no joint can be commanded")
@@ -329,7 +329,7 @@ def as_log(
     from sysid_btr.io.log import MOTION, Log, LogMeta
     from sysid_btr.models.robot import servo_joints
 
-    model = robot.compile()
+    model = robot.model
     time, moving = family.commands(coefficients, times)
     channels = {
         f"command.{name}": np.full(len(time), float(model.qpos0[model.joint(name).qposadr[0]]))

@@ -248,7 +248,7 @@ def measure_scales(
         velocity.append(v)
         acceleration.append(np.gradient(v, time, axis=0))
         span.append(np.nanmax(q, axis=0) - np.nanmin(q, axis=0))
-    model = robot.compile()
+    model = robot.model
     t, v, a = (np.concatenate(x) for x in (torque, velocity, acceleration))
     reach = np.max(span, axis=0)
 
@@ -274,7 +274,7 @@ def measure_scales(
 
 def _torque_asked(robot: Robot, log: Log) -> dict[str, FloatArray]:
     """Torque (n,) of each joint's servo for the commands and positions as logged."""
-    model = robot.compile()
+    model = robot.model
     index = make_index(model)
     driven = [j for j, a in zip(index.joints, index.actuator, strict=True) if a >= 0]
     blank = np.full(len(log), np.nan)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from sysid_btr.errors import ModelError
 from sysid_btr.mujoco_conventions import SINGLE, slides
@@ -54,7 +57,7 @@ class Robot:
             "joints": ", ".join(joint_names(self)),
             "with a servo": ", ".join(servo_joints(self)),
             "bodies": ", ".join(body_names(self)),
-            "mass": f"{float(self.compile().body_mass.sum()):.4g} kg",
+            "mass": f"{float(self.model.body_mass.sum()):.4g} kg",
         }
         return facts_html(f"robot {self.name}", facts)
 
@@ -71,8 +74,22 @@ class Robot:
         listing = {"body": body_names, "joint": joint_names, "servo": servo_joints}
         return listing[scope](self) if scope in listing else (scope,)
 
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The plain model, shared by all who read it; `compile` gives one that may be changed."""
+        return self.compile()
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Digest of the compiled model, and so of all files that it was made of."""
+        import mujoco
+
+        content = np.empty(mujoco.mj_sizeModel(self.model), dtype=np.uint8)
+        mujoco.mj_saveModel(self.model, None, content)
+        return _digest(content.tobytes())
+
     def compile(self) -> mujoco.MjModel:
-        """The plain model."""
+        """The plain model, compiled anew."""
         try:
             return self.make_spec().compile()
         except ValueError as error:
@@ -113,13 +130,13 @@ def robot_from_spec(name: str, make_spec: Callable[[], mujoco.MjSpec], **known: 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
     """Hinge and slide joints of the model, in model order."""
-    model = robot.compile()
+    model = robot.model
     return tuple(model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in SINGLE)
 
 
 def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
     """Joint limits where the model states them, rad or m."""
-    model = robot.compile()
+    model = robot.model
     ranges = {}
     for i in range(model.njnt):
         low, high = model.jnt_range[i]
@@ -130,7 +147,7 @@ def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
 
 def channel_units(robot: Robot) -> dict[str, str]:
     """Unit of each channel on this robot; both where it has hinges and slides."""
-    model = robot.compile()
+    model = robot.model
     found = {slides(model, j) for j in joint_names(robot)}
     kinds = [k for k, there in ((0, False in found), (1, True in found)) if there]
     return {channel: ", ".join(units[k] for k in kinds) for channel, units in CHANNEL_UNITS.items()}
@@ -138,13 +155,13 @@ def channel_units(robot: Robot) -> dict[str, str]:
 
 def body_names(robot: Robot) -> tuple[str, ...]:
     """Bodies of the model with mass, in model order."""
-    model = robot.compile()
+    model = robot.model
     return tuple(model.body(i).name for i in range(1, model.nbody) if model.body_mass[i] > 0)
 
 
 def servo_joints(robot: Robot) -> tuple[str, ...]:
     """Joints that a position servo drives, in model order."""
-    model = robot.compile()
+    model = robot.model
     return tuple(model.joint(int(model.actuator_trnid[a, 0])).name for a in servo_actuators(model))
 
 

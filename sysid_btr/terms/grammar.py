@@ -32,7 +32,8 @@ class Robot(Protocol):
     @property
     def fields(self) -> Mapping[str, type[Term]]: ...
 
-    def compile(self) -> mujoco.MjModel: ...
+    @property
+    def model(self) -> mujoco.MjModel: ...
 
     def names(self, scope: Scope) -> tuple[str, ...]: ...
 
@@ -154,7 +155,7 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
     kinds = bare.kinds if scales is None else bare.sized(largest_scale(scales, places))
     fixed = tuple(None if v is None else k.nominal for k, v in zip(kinds, bare.fixed, strict=False))
     term = replace(bare, places=places, shared=len(places) > 1, fixed=fixed)
-    model = robot.compile()
+    model = robot.model
     if term.absolute:
         kinds = (term.absolute_kind(kinds[0], term.own_value(model, places[0])),)
     free = [k for k, v in zip(kinds, fixed, strict=True) if v is None] if fixed else kinds
