@@ -9,17 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walks import Truth, plain_walk, record_walk
+from walks import Scale, Truth, plain_walk, record_walk
 
 from sysid_btr.errors import LogError, ModelError
 from sysid_btr.floating_base.estimate import BaseState, estimate_base, find_contacts
 from sysid_btr.floating_base.events import FALLEN, Event, find_fall, find_pickups, find_slips, usable
 from sysid_btr.floating_base.feet import force_columns, points_in_base, touching_bodies
+from sysid_btr.floating_base.size import NAO, BodySize, measure_size
 from sysid_btr.floating_base.smoothing import smooth_joints
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
+from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import Numerics
 
@@ -128,8 +130,18 @@ def test_a_held_model_is_refused_for_a_free_log() -> None:
         estimate_base(model, log, index.joints, index.qpos)
 
 
+@cache
+def pushed_over() -> tuple[Log, Truth]:
+    return record_walk(Gait(), 6.0, push=lambda t: np.array([0.0, 25.0 * (3.0 < t < 3.4), 0.0]))
+
+
+@cache
+def lifted() -> tuple[Log, Truth]:
+    return record_walk(Gait(), 6.0, push=lambda t: np.array([0.0, 0.0, 60.0 * (3.0 < t < 3.3)]))
+
+
 def test_a_push_over_is_a_fall_and_nothing_after_it_is_used() -> None:
-    log, truth = record_walk(Gait(), 6.0, push=lambda t: np.array([0.0, 25.0 * (3.0 < t < 3.4), 0.0]))
+    log, truth = pushed_over()
     state = estimate(log, truth)
     tilt = np.arccos(np.clip(truth.rotation[:, 2, 2], -1, 1))
     first = log.time[np.argmax(tilt > FALLEN)]
@@ -141,15 +153,14 @@ def test_a_push_over_is_a_fall_and_nothing_after_it_is_used() -> None:
 
 
 def test_a_lifted_robot_is_found() -> None:
-    log, truth = record_walk(Gait(), 6.0, push=lambda t: np.array([0.0, 0.0, 60.0 * (3.0 < t < 3.3)]))
-    kinds = {e.kind: e for e in estimate(log, truth).events}
+    kinds = {e.kind: e for e in estimate(*lifted()).events}
     assert "pick-up" in kinds
     assert 2.9 < kinds["pick-up"].start < 3.3
 
 
 def test_events_leave_out_what_surrounds_them() -> None:
     time = np.arange(0, 10, 0.02)
-    keep = usable(time, (Event("slip", 2.0, 2.2), Event("fall", 8.0, 10.0)))
+    keep = usable(time, (Event("slip", 2.0, 2.2), Event("fall", 8.0, 10.0)), NAO)
     assert not keep[(time > 1.95) & (time < 2.25)].any()
     assert keep[(time > 2.4) & (time < 7.6)].all()
     assert not keep[time > 7.8].any()
@@ -167,28 +178,28 @@ def test_short_flights_and_still_feet_are_no_events() -> None:
     time = np.arange(0, 3, 0.02)
     load = np.full(len(time), 40.0)
     load[50:54] = 0.0
-    assert find_pickups(time, load) == ()
+    assert find_pickups(time, load, NAO) == ()
     load[100:120] = 0.0
-    (event,) = find_pickups(time, load)
+    (event,) = find_pickups(time, load, NAO)
     assert (event.start, event.stop) == (pytest.approx(2.0), pytest.approx(2.38))
     speed = np.full((len(time), 1), 0.02)
     loaded = np.ones((len(time), 1), dtype=bool)
     std = np.full((len(time), 1), 0.01)
-    assert find_slips(time, speed, std, loaded) == ()
+    assert find_slips(time, speed, std, loaded, NAO) == ()
     speed[30:40] = 0.3
-    (slip,) = find_slips(time, speed, std, loaded)
+    (slip,) = find_slips(time, speed, std, loaded, NAO)
     assert slip.kind == "slip"
-    assert find_slips(time, speed, 10 * std, loaded) == ()  # it could be noise
+    assert find_slips(time, speed, 10 * std, loaded, NAO) == ()  # it could be noise
 
 
 def test_a_dropped_force_sample_does_not_lift_a_foot() -> None:
     load = np.tile([20.0, 20.0], (9, 1))
     load[4, 0] = 0.0
     bottom = np.full((9, 2), -0.3)
-    assert find_contacts(bottom, load).all()
+    assert find_contacts(bottom, load, NAO).all()
     load[3:6, 0] = 0.0
-    assert not find_contacts(bottom, load)[4, 0]
-    assert not find_contacts(bottom - [[0.0, 0.05]], None)[:, 0].any()
+    assert not find_contacts(bottom, load, NAO)[4, 0]
+    assert not find_contacts(bottom - [[0.0, 0.05]], None, NAO)[:, 0].any()
 
 
 def test_points_of_the_feet_follow_the_joints() -> None:
@@ -245,3 +256,67 @@ def recorded(folder: Path, name: str) -> BaseState:
     model = compile_model(robot, log, (), Numerics("RK4", 0.005))
     index = make_index(model)
     return estimate_base(model, log, index.joints, index.qpos)
+
+
+# --- robots of other sizes ------------------------------------------------------------------------------
+
+
+def test_the_size_of_a_robot_is_that_of_its_longest_leg() -> None:
+    def size(robot: Robot) -> BodySize:
+        return measure_size(robot.compile())
+
+    assert size(load_robot("nao:table1")) == NAO
+    # coxa, femur and tibia of the outer legs, and the ball at their end
+    assert size(load_robot("ant")).leg == pytest.approx(0.13 + 0.1 + 0.14 + 0.012)
+    own, large = size(load_robot("nao")), size(Scale(3.0).robot)
+    assert large.leg == pytest.approx(3 * own.leg)
+    assert large.weight == pytest.approx(27 * own.weight)
+    assert large.time(0.2) == pytest.approx(np.sqrt(3) * own.time(0.2))
+    assert large.speed(0.2) == pytest.approx(np.sqrt(3) * own.speed(0.2))
+
+
+def test_under_less_gravity_a_robot_moves_more_slowly() -> None:
+    moon = replace(NAO, gravity=NAO.gravity / 6)
+    assert moon.time(1.0) == pytest.approx(np.sqrt(6))
+    assert moon.length(1.0) == NAO.length(1.0)
+    assert moon.speed(1.0) == pytest.approx(1 / np.sqrt(6))
+
+
+def test_what_has_no_weight_does_not_walk() -> None:
+    spec = load_robot("nao").make_spec()
+    spec.option.gravity = [0.0, 0.0, 0.0]
+    with pytest.raises(ModelError, match="no weight"):
+        measure_size(spec.compile())
+
+
+WALKS = {
+    "walk": plain_walk,
+    "fall": pushed_over,
+    "pick-up": lifted,
+    "no force sensors": lambda: (without(plain_walk()[0], "force."), plain_walk()[1]),
+    "no inclinometers": lambda: (without(plain_walk()[0], "imu.angle"), plain_walk()[1]),
+    "no accelerometer": lambda: (without(plain_walk()[0], "imu.acc"), plain_walk()[1]),
+}
+
+
+@cache
+def estimated(walk: str) -> BaseState:
+    return estimate(*WALKS[walk]())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [3.0, 1 / 3])
+@pytest.mark.parametrize("walk", WALKS)
+def test_the_base_of_a_robot_of_another_size_is_found_as_well(walk: str, length: float) -> None:
+    (log, truth), own, scale = WALKS[walk](), estimated(walk), Scale(length)
+    with scale.sensors():
+        other = estimate(scale.log(log), replace(truth, model=scale.robot.compile()))
+    units = {"position": length, "velocity": length / scale.time, "rate": 1 / scale.time}
+    units |= {"joint_velocity": 1 / scale.time, "rotation": 1.0, "joint_position": 1.0}
+    for name in (*units, *(f"{name}_std" for name in units)):
+        expected = units[name.removesuffix("_std")] * getattr(own, name)
+        assert np.abs(getattr(other, name) - expected).max() < 1e-7 * np.abs(expected).max(), name
+    assert np.array_equal(other.contact, own.contact)
+    assert np.array_equal(other.usable, own.usable)
+    assert [e.kind for e in other.events] == [e.kind for e in own.events]
+    assert [e.start for e in other.events] == pytest.approx([scale.time * e.start for e in own.events])

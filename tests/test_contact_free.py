@@ -13,6 +13,7 @@ from benchmarks import ground
 from sysid_btr.floating_base import contact_free
 from sysid_btr.floating_base.contact_free import difference, without_ground
 from sysid_btr.floating_base.segments import FloatingReplay
+from sysid_btr.floating_base.size import NAO
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
@@ -82,7 +83,7 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
         measured=rng.normal(size=(n, joints + 5)),
         sigma=np.where(rng.random((n, joints + 5)) < 0.2, np.inf, 0.5),
         time=np.arange(n) * 0.02,
-        weight=0.01,
+        size=replace(NAO, weight=0.01),
     )
     shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3]
     known = contact_free._Derivatives(*(0.1 * rng.normal(size=s) for s in shapes))
@@ -90,9 +91,7 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
     found = contact_free._linearise(chain, known, ends)
 
     sizes, forces, _ = contact_free._unexplained(chain, known)
-    kinds = (contact_free.SLACK_POSITION,) * 2 + (contact_free.SLACK_VELOCITY,) * 2
-    kinds += (contact_free.SLACK_POSITION, contact_free.SLACK_VELOCITY)
-    slack, loose = contact_free._each(kinds, states), contact_free._each(contact_free.LOOSE, states)
+    slack, loose = (contact_free._each(kinds, chain) for kinds in (contact_free.SLACK, contact_free.LOOSE))
     sight, seen = contact_free._measurements(chain)
     k = len(sizes)
     unknown = n * d + w * k

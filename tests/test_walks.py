@@ -10,16 +10,18 @@ import mujoco
 import numpy as np
 import pytest
 from toys import pendulum, swing
-from walks import Truth, plain_walk, record_walk
+from walks import Scale, Truth, plain_walk, record_walk
 
 from sysid_btr.errors import LogError
 from sysid_btr.estimators import Budget, Journal, silent
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.floating_base import segments as segments_module
+from sysid_btr.floating_base.contact_free import without_ground
 from sysid_btr.floating_base.episode import FloatingEpisode, reconstruct
 from sysid_btr.floating_base.estimate import BaseState
 from sysid_btr.floating_base.initial_states import start_lanes
-from sysid_btr.floating_base.segments import covered, segment_best, segment_log, segment_seconds
+from sysid_btr.floating_base.segments import SegmentLength, covered, segment_best, segment_log, segment_seconds
+from sysid_btr.floating_base.size import measure_size
 from sysid_btr.floating_base.strides import of_legs, repeated_error, stride
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fit import Fit, fit
@@ -295,10 +297,16 @@ def test_a_fall_ends_a_walk() -> None:
     assert len(base.time) == len(walked)
 
 
-def test_the_length_of_segments_weighs_information_against_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(segments_module, "LENGTHS", (0.1, 0.2))
-    monkeypatch.setattr(segments_module, "TRIED", 4)
-    segments, lengths = segment_best(load_robot("nao"), *reconstructed(), (7.0,), threads=2)
+@cache
+def best_segments() -> tuple[Windows, tuple[SegmentLength, ...]]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segments_module, "LENGTHS", (0.1, 0.2))
+        patch.setattr(segments_module, "TRIED", 4)
+        return segment_best(load_robot("nao"), *reconstructed(), (7.0,), threads=2)
+
+
+def test_the_length_of_segments_weighs_information_against_misfit() -> None:
+    segments, lengths = best_segments()
     assert [c.seconds for c in lengths] == pytest.approx([0.2, 0.1])  # the model is right: longer is better
     longer, shorter = lengths
     assert longer.information > shorter.information
@@ -384,14 +392,68 @@ def test_a_robot_that_walks_and_hangs_is_known_better_than_from_either_log() -> 
 
 
 def test_the_stride_is_the_time_after_which_the_commands_of_a_walk_repeat() -> None:
-    for period in (0.8, 1.0, 1.3):
+    size = reconstructed()[1].size
+    for period in (0.8, 1.3, 2.4):
         time = np.arange(0.0, 12.0, 0.02)
         commands = {f"command.{j}": c for j, c in gait(Gait(period=period), time).items()}
         log = replace(plain_walk()[0], time=time, channels=commands, episode=np.zeros(len(time), dtype=np.int64))
-        assert stride(log) == pytest.approx(period, abs=0.03)
+        assert stride(log, size) == pytest.approx(period, abs=0.03)
     rng = np.random.default_rng(1)
+    for scale in (Scale(3.0), Scale(1 / 3)):
+        found = stride(scale.log(log), measure_size(scale.robot.compile()))
+        assert found == pytest.approx(scale.time * period, abs=0.06)
     wandering = {name: np.cumsum(rng.normal(size=len(time))) for name in commands}
-    assert stride(replace(log, channels=wandering)) is None
+    assert stride(replace(log, channels=wandering), size) is None
+
+
+@cache
+def small_study(length: float) -> Study:
+    """Of the same walk of a Nao so many times as long."""
+    scale = Scale(length)
+    with pytest.MonkeyPatch.context() as patch, scale.sensors():
+        patch.setattr(segments_module, "LENGTHS", (0.1, 0.2))
+        patch.setattr(segments_module, "TRIED", 2)
+        return make_study(scale.robot, [scale.log(plain_walk()[0].window(50, 150))], threads=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [3.0, 1 / 3])
+def test_a_walk_of_another_size_poses_the_same_problem(length: float) -> None:
+    problems, deviations = [], []
+    pace = Scale(length).time
+    own, other = small_study(1.0), small_study(length)
+    for study in (own, other):
+        problem = study.train_problem(study.declare(["mass:LKneePitch,Torso", "kp:*=shared"]))
+        residual, jacobian = linearise(problem, problem.start, step=study.stencil(problem.terms))
+        problems.append((residual, jacobian, problem.blocks))
+        deviations.append(estimates(problem.parameters, problem.start, jacobian, residual, problem.blocks))
+    for mine, theirs in zip(*problems, strict=True):
+        assert np.abs(mine - theirs).max() < 1e-6 * np.abs(mine).max()
+    assert [e.std for e in deviations[1]] == pytest.approx([e.std for e in deviations[0]])
+    for mine, theirs in zip((*own.train, *own.holdout), (*other.train, *other.holdout), strict=True):
+        assert isinstance(mine, FloatingEpisode)
+        assert isinstance(theirs, FloatingEpisode)
+        assert np.array_equal(mine.segments.rows, theirs.segments.rows)
+        assert len(mine.shortened(60.0).segments) == len(theirs.shortened(60.0 * pace).segments)
+        for a, b in zip(mine.lengths, theirs.lengths, strict=True):
+            assert (b.seconds, b.information, b.misfit) == pytest.approx((pace * a.seconds, a.information, a.misfit))
+    steps = [(s.numerics.timestep, s.coarse.timestep, s.cheap.timestep) for s in (own, other)]
+    assert steps[1] == pytest.approx(pace * np.array(steps[0]))
+
+
+@pytest.mark.slow
+def test_the_motion_of_a_robot_of_another_size_tells_as_much_of_its_masses() -> None:
+    found = []
+    for scale in (Scale(1.0), Scale(3.0)):
+        study = small_study(scale.length)
+        problem = study.train_problem(study.declare(["mass:LKneePitch,LShoulderRoll"]))
+        with scale.sensors():
+            known = without_ground(problem, problem.start)
+        assert known is not None
+        found.append(known)
+    own, other = found
+    assert np.abs(other.mean - own.mean).max() < 1e-4 * np.sqrt(np.diag(own.covariance)).min()
+    np.testing.assert_allclose(other.covariance, own.covariance, rtol=1e-4)
 
 
 def test_an_error_that_every_stride_repeats_is_not_averaged_away() -> None:

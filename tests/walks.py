@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cache
 
 import mujoco
 import numpy as np
+import pytest
 
+from sysid_btr.floating_base import contact_free, orientation
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
+from sysid_btr.models.robot import Robot
 
 TICK = 2 * np.pi / 4096
 PERIOD = 0.02
@@ -123,3 +127,71 @@ def record_walk(
 def plain_walk() -> tuple[Log, Truth]:
     """Ten seconds of the default walk."""
     return record_walk(Gait(), 10.0)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A Nao so many times as long, of the same density, under the same gravity.
+
+    What it does is what the Nao does, in units of its length, its mass and the time that a fall of its length takes.
+    """
+
+    length: float
+
+    @property
+    def time(self) -> float:
+        return float(np.sqrt(self.length))
+
+    @property
+    def mass(self) -> float:
+        return self.length**3
+
+    @property
+    def torque(self) -> float:
+        return self.mass * self.length
+
+    @property
+    def robot(self) -> Robot:
+        nao = load_robot("nao")
+        return replace(nao, name=f"nao of {self.length:g}", digest=str(self.length), make_spec=self._spec)
+
+    def _spec(self) -> mujoco.MjSpec:
+        spec = load_robot("nao").make_spec()
+        # where MuJoCo's solver stops is in nobody's units: far beyond what is compared
+        spec.option.tolerance = 1e-13
+        for part in (*spec.bodies, *spec.geoms, *spec.sites):
+            part.pos = np.multiply(part.pos, self.length)
+        for part in (*spec.geoms, *spec.sites):
+            part.size = np.multiply(part.size, self.length)
+        for geom in spec.geoms:
+            geom.mass *= self.mass
+            geom.solref = np.multiply(geom.solref, [self.time, 1.0])
+            geom.solimp = np.multiply(geom.solimp, [1.0, 1.0, self.length, 1.0, 1.0])
+        for joint in spec.joints:
+            joint.armature *= self.torque * self.time**2
+            joint.damping = np.multiply(joint.damping, self.torque * self.time)
+        for servo in spec.actuators:
+            servo.gainprm = np.multiply(servo.gainprm, self.torque)
+            servo.biasprm = np.multiply(servo.biasprm, self.torque)
+            servo.biasprm[2] *= self.time
+        for tie in spec.equalities:
+            tie.solref = np.multiply(tie.solref, [self.time, 1.0])
+        return spec
+
+    @contextmanager
+    def sensors(self) -> Iterator[None]:
+        """Sensors and a bus that are worse by as much as everything is slower: theirs are not the robot's times."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(orientation, "DRIFT", orientation.DRIFT / np.sqrt(self.time))
+            patch.setattr(contact_free, "LATE", contact_free.LATE * self.time)
+            yield
+
+    def log(self, log: Log) -> Log:
+        """What the sensors of this robot would have shown of a Nao's walk, their noise as large beside the motion."""
+        units = {"imu.gyro": 1 / self.time, "force": self.mass}
+        channels = {
+            name: column * next((unit for start, unit in units.items() if name.startswith(start)), 1.0)
+            for name, column in log.channels.items()
+        }
+        meta = replace(log.meta, sample_period=PERIOD * self.time)
+        return replace(log, time=log.time * self.time, channels=channels, meta=meta)

@@ -80,7 +80,9 @@ class TrialEpisode(Episode):
 
     fixed: Model = PLAIN
 
-    procedure: ClassVar[Procedure] = TrialProcedure()
+    @property
+    def procedure(self) -> Procedure:
+        return TrialProcedure()
 
     def replay(
         self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0

@@ -5,6 +5,7 @@ contact: in each of them forces and torques that nobody knows act on the feet th
 are what the encoders, the gyro and the vertical of the log leave most probable. What is left tells of the masses, and
 holds on springs, on carpet and on gravel (simultaneous estimation of inputs and states: Gillijns and De Moor 2007,
 doi:10.1016/j.automatica.2006.08.002; as one sparse least-squares problem over the walk).
+Lengths, times and speeds below are the Nao's; `BodySize` makes them those of the robot.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.floating_base.estimate import NEAR, BaseState, foot_loads, imu_columns, lowest_points, vertical
 from sysid_btr.floating_base.feet import touching_bodies
-from sysid_btr.floating_base.segments import FloatingReplay, starts_at
+from sysid_btr.floating_base.segments import FloatingReplay, starts_at, whole_step
+from sysid_btr.floating_base.size import BodySize
 from sysid_btr.io.log import Log
 from sysid_btr.mujoco_conventions import to_rotation
 from sysid_btr.objectives.covariance import Known, covariance
@@ -52,20 +54,20 @@ lever (m) it is that of the torque."""
 JOLTS = (0.0001, 0.0003, 0.001, 0.003, 0.009)
 """The same of what the force does beside its mean, at either end of a sample, in weights times seconds: the likeliest
 of these, as a loose one lets noise pass for motion."""
-GRAVITY = 9.81
-SLACK_POSITION, SLACK_VELOCITY = 2e-5, 1e-3
-"""rad (m) and rad/s (m/s) by which a step may err for other reasons."""
+SLACK = (2e-5, 2e-5, 1e-3, 1e-3, 2e-5, 1e-3)
+"""By which a step may err for other reasons in base position, rotation, velocity, angular velocity, joint positions and
+joint velocities."""
 LOOSE = (0.1, 0.3, 1.0, 3.0, 0.1, 5.0)
-"""Standard deviations by which a round may move base position, rotation, velocity, angular velocity, joint positions
-and joint velocities: what nothing measures must stay somewhere."""
+"""Standard deviations by which a round may move the same: what nothing measures must stay somewhere."""
 NUDGE = (0.01, 0.001, 0.01, 0.01, 0.001, 0.02)
 """Changes of the same by which derivatives are taken."""
 NUDGE_FORCE, NUDGE_TORQUE = 1.0, 0.1
+"""... and of forces, N, and torques, Nm."""
 NUDGE_NUMBER = 0.02
 """... and the same for the numbers: fractions of their ranges."""
 LATE = 0.001
 """s, standard deviation of what sensors and commands may be apart in time beyond the model: a tick of a loop at 1 kHz.
-A gain and a fraction of a millisecond look much alike."""
+A gain and a fraction of a millisecond look much alike. Of the bus, whatever the size of the robot."""
 LEAST = 50
 """Samples that a walk must have."""
 
@@ -155,7 +157,7 @@ class _Chain:
     measured, sigma : (n, j + 5) joint positions, gyro, and x and y of the vertical in the base's frame; sigma is
         infinite where there is no value.
     time : (n,) s since the first sample.
-    weight : of the robot, N.
+    size : of the robot.
     jolt : one of `JOLTS`.
     """
 
@@ -166,7 +168,7 @@ class _Chain:
     measured: FloatArray
     sigma: FloatArray
     time: FloatArray
-    weight: float
+    size: BodySize
     jolt: float = JOLTS[2]
 
 
@@ -292,22 +294,19 @@ def _written(replay: WindowReplay, values: FloatArray) -> BatchModel:
 
 def _chain(replay: FloatingReplay) -> _Chain:
     """A walk with its states as they were reconstructed, and the weight shared out evenly among what touches."""
-    import mujoco
-
     walk, base = replay.log, replay.base
     assert base is not None
     n = len(walk)
     states = starts_at(base, np.stack([np.arange(n), np.arange(n) + 2], axis=1))
     own = {f.name: getattr(replay, f.name) for f in fields(replay)} | {"effort": False}
     steps = SampleSteps(**{**own, "windows": states.chosen(np.arange(n - 1))})
-    weight = GRAVITY * float(mujoco.mj_getTotalmass(steps.model))
     near = _touching(steps.model, walk, base)
     touch = near[:-1] | near[1:]
     share = touch / np.maximum(touch.sum(axis=1, keepdims=True), 1)
     wrench = np.zeros((n - 1, touch.shape[1], 6))
-    wrench[:, :, 2] = weight * share
+    wrench[:, :, 2] = base.size.weight * share
     gyro = imu_columns(walk, ("gyro_x", "gyro_y", "gyro_z"))
-    up, up_std = vertical(walk, gyro, [])
+    up, up_std = vertical(walk, base.size, [])
     joints = [walk.channels[f"position.{j}"] if walk.has("position", j) else np.full(n, np.nan) for j in base.joints]
     measured = np.column_stack([*joints, gyro, up[:, :2]])
     noise = np.array([noise_floor(c).sigma if np.isfinite(c).any() else np.inf for c in (*joints, *gyro.T)])
@@ -323,7 +322,7 @@ def _chain(replay: FloatingReplay) -> _Chain:
         measured=np.nan_to_num(measured),
         sigma=sigma,
         time=walk.time - walk.time[0],
-        weight=weight,
+        size=base.size,
     )
 
 
@@ -334,9 +333,9 @@ def _touching(model: mujoco.MjModel, walk: Log, base: BaseState) -> BoolArray:
     low = lowest_points(model, feet, base)
     above = low - low.min(axis=1, keepdims=True)
     if load is None:
-        near = above < NEAR
+        near = above < base.size.length(NEAR)
     else:
-        near = (above < LOWEST_LOADED) | (load > LIGHTEST * float(np.median(load.sum(axis=1))))
+        near = (above < base.size.length(LOWEST_LOADED)) | (load > LIGHTEST * float(np.median(load.sum(axis=1))))
     wide: BoolArray = near.copy()
     wide[1:] |= near[:-1]
     wide[:-1] |= near[1:]
@@ -350,14 +349,14 @@ beyond which it does."""
 
 def _derive(chain: _Chain, values: FloatArray) -> _Derivatives:
     """How the end of each step depends on its start and the forces in it, which hardly depends on the numbers."""
-    steps, d = _coarse(chain.steps), chain.states.std.shape[1]
+    steps, d = _coarse(chain), chain.states.std.shape[1]
     w, forces = len(chain.touch), chain.touch.shape[1] * 6
-    size = _each(NUDGE, chain.states)
+    size = _each(NUDGE, chain)
     # without contact nothing depends on where the base is, and its velocity only adds to where it gets
     lanes = np.array([3, 4, 5, 9, 10, 11, *range(BASE, d)])
     nudges = np.zeros((1 + len(lanes) + forces, d + forces))
     nudges[1 + np.arange(len(lanes)), lanes] = size[lanes]
-    kinds = np.tile([NUDGE_FORCE] * 3 + [NUDGE_TORQUE] * 3, forces // 6)
+    kinds = chain.size.force(1.0) * np.tile([NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3, forces // 6)
     nudges[1 + len(lanes) + np.arange(forces), d + np.arange(forces)] = kinds
     count = len(nudges)
     window, lane = np.repeat(np.arange(w), count), np.tile(np.arange(count), w)
@@ -373,9 +372,8 @@ def _derive(chain: _Chain, values: FloatArray) -> _Derivatives:
     return _Derivatives(start, mean * on, start @ blows[:-1] * on, blows[1:] * on)
 
 
-def _coarse(steps: SampleSteps) -> SampleSteps:
-    period = float(steps.log.time[1] - steps.log.time[0])
-    step = period / int(np.ceil(period / COARSE - 1e-9))
+def _coarse(chain: _Chain) -> SampleSteps:
+    step, steps = whole_step(float(chain.time[1]), chain.size.time(COARSE)), chain.steps
     return replace(steps, numerics=replace(steps.numerics, integrator="RK4", timestep=step))
 
 
@@ -435,7 +433,7 @@ def _simulate(chain: _Chain, values: FloatArray, free: IntArray, step: FloatArra
     candidates[1 + np.arange(len(free)), free] += step
     count = len(candidates)
     row, window = np.tile(np.arange(count), w), np.repeat(every, count)
-    coarse = _coarse(steps)
+    coarse = _coarse(chain)
     around = coarse.ends(candidates, row, window, nothing[window])
     plain = around.chosen(every * count)
     by_number = difference(around, plain.chosen(window)).reshape(w, count, -1)[:, 1:] / step[:, None]
@@ -477,7 +475,7 @@ def _linearise(chain: _Chain, known: _Derivatives, ends: _Ends) -> _Round:
         # what the candidate as it is leaves comes first, then a unit of each number
         sides = np.roll(sides, 1, axis=2)
         sight, seen = _measurements(chain)
-        diagonal = sight.transpose(0, 2, 1) @ sight + np.diag(_each(LOOSE, chain.states) ** -2.0)
+        diagonal = sight.transpose(0, 2, 1) @ sight + np.diag(_each(LOOSE, chain) ** -2.0)
         diagonal[:-1] += before.transpose(0, 2, 1) @ before
         diagonal[1:] += after.transpose(0, 2, 1) @ after
         linear = np.zeros((n, d, 1 + p))
@@ -492,28 +490,29 @@ def _linearise(chain: _Chain, known: _Derivatives, ends: _Ends) -> _Round:
     missed = sides - before @ states[:-1] - after @ states[1:]
     told = -sight @ states
     told[:, :, 0] += seen
-    kept = -states / _each(LOOSE, chain.states)[:, None]
+    kept = -states / _each(LOOSE, chain)[:, None]
     left = np.concatenate([part.reshape(-1, 1 + p) for part in (missed, told, kept)])
     volume = np.log(np.diagonal(factor, axis1=1, axis2=2))[chain.linked].sum() + np.log(band[0]).sum()
     surprise = float(left[:, 0] @ left[:, 0]) + 2 * float(volume)
-    stretch = (chain.time / BLOCK).astype(np.int64)
+    stretch = (chain.time / chain.size.time(BLOCK)).astype(np.int64)
     blocks = np.concatenate([np.repeat(stretch[:w], d), np.repeat(stretch, told.shape[1]), np.repeat(stretch, d)])
     return _Round(left, blocks, surprise, solved, ends)
 
 
 def _unexplained(chain: _Chain, known: _Derivatives) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sizes of the unknown forces (18 f,), what one of its size does (w, d, 18 f), and the covariance of their sum."""
-    kinds = np.tile([1.0, 1.0, 1.0, LEVER, LEVER, LEVER], chain.touch.shape[1])
-    sizes = np.concatenate([STEADY * kinds, chain.jolt * kinds, chain.jolt * kinds]) * chain.weight
+    size = chain.size
+    kinds = np.tile([1.0] * 3 + [size.length(LEVER)] * 3, chain.touch.shape[1])
+    jolt = size.time(chain.jolt) * kinds
+    sizes = np.concatenate([STEADY * kinds, jolt, jolt]) * size.weight
     forces = np.concatenate([known.mean, known.blow, known.last], axis=2) * sizes
-    slack = _each((SLACK_POSITION, SLACK_POSITION, *[SLACK_VELOCITY] * 2, SLACK_POSITION, SLACK_VELOCITY), chain.states)
-    return sizes, forces, forces @ forces.transpose(0, 2, 1) + np.diag(slack**2)
+    return sizes, forces, forces @ forces.transpose(0, 2, 1) + np.diag(_each(SLACK, chain) ** 2)
 
 
-def _each(kinds: Sequence[float], states: Windows) -> FloatArray:
-    """(d,) one number for every coordinate of a state from one for every kind."""
-    joints = states.joint_position.shape[1]
-    return np.repeat(kinds, [3, 3, 3, 3, joints, joints])
+def _each(kinds: Sequence[float], chain: _Chain) -> FloatArray:
+    """(d,) one number for every coordinate of a state from a Nao's for every kind."""
+    joints = chain.states.joint_position.shape[1]
+    return np.repeat(chain.size.state(kinds), [3, 3, 3, 3, joints, joints])
 
 
 def _measurements(chain: _Chain) -> tuple[FloatArray, FloatArray]:

@@ -23,6 +23,7 @@ from sysid_btr.floating_base.segments import (
     segment_numerics,
     segment_seconds,
     spread_evenly,
+    whole_step,
 )
 from sysid_btr.identify.deferred import LEAST_GAIN
 from sysid_btr.identify.episode import E, Episode, Fused, Inflation, Procedure
@@ -30,7 +31,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.marginal import Marginal
-from sysid_btr.objectives.problem import Comparison, ReplayProblem
+from sysid_btr.objectives.problem import BLOCK, Comparison, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import Windows
@@ -38,13 +39,21 @@ from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Terms
 
 MOST_WALKED = 8.0
-"""s of segments on which hypotheses about a walk are compared."""
+"""s of a Nao (`BodySize`): of segments on which hypotheses about a walk are compared."""
 COUNTED_LESS = 0.9
 """Weight below which a segment counts as one that the model does not explain."""
 
 
+@dataclass(frozen=True)
 class FloatingProcedure(Procedure):
-    """How a fit goes about episodes of a floating base: impacts roughen the objective, and no step is fine enough."""
+    """How a fit goes about episodes of a floating base: impacts roughen the objective, and no step is fine enough.
+
+    Attributes
+    ----------
+    longest_step : of the coarse integrator, s.
+    """
+
+    longest_step: float = np.inf
 
     demand: ClassVar[int] = 1
     alternations: ClassVar[tuple[int, ...]] = (5, 3)
@@ -59,7 +68,7 @@ class FloatingProcedure(Procedure):
     no_torque: ClassVar[str] = "its base was floating, and segments are too short"
 
     def coarse(self, numerics: Numerics) -> Numerics:
-        step = min(numerics.timestep, FASTEST)
+        step = whole_step(numerics.timestep, self.longest_step)
         return replace(numerics, integrator="implicitfast", timestep=step, servo_period=None)
 
     def cheap(self, numerics: Numerics) -> Numerics:
@@ -102,7 +111,9 @@ class FloatingEpisode(Episode):
     marginal: Marginal | None = None
     lengths: tuple[SegmentLength, ...] = ()
 
-    procedure: ClassVar[Procedure] = FloatingProcedure()
+    @property
+    def procedure(self) -> Procedure:
+        return FloatingProcedure(self.base.size.time(FASTEST))
 
     @classmethod
     def whole(cls, robot: Robot, log: Log, threads: int = 0) -> FloatingEpisode:
@@ -152,11 +163,11 @@ class FloatingEpisode(Episode):
         threads: int = 0,
     ) -> Comparison:
         plain = super().compare(terms, channels, numerics, inflation=inflation, threads=threads)
-        return replace(plain, marginal=self.marginal)
+        return replace(plain, marginal=self.marginal, stretch=self.base.size.time(BLOCK))
 
     def shortened(self, seconds: float) -> FloatingEpisode:
         """The same samples with few segments, spread evenly over them."""
-        return self._with(spread_evenly(self.segments, self.log, min(seconds, MOST_WALKED)))
+        return self._with(spread_evenly(self.segments, self.log, min(seconds, self.base.size.time(MOST_WALKED))))
 
     def _with(self, which: IntArray) -> FloatingEpisode:
         marginal = None if self.marginal is None else self.marginal.chosen(which)
@@ -177,7 +188,7 @@ class FloatingEpisode(Episode):
         return replace(self, segments=segments, marginal=None)
 
     def choose_numerics(self, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
-        return segment_numerics(self.robot, self.log, self.segments, threads, simulator)
+        return segment_numerics(self.robot, self.log, self.segments, self.base.size, threads, simulator)
 
     def facts(self) -> Mapping[str, Any]:
         weight = np.ones(0) if self.marginal is None else self.marginal.weight

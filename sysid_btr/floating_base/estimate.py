@@ -3,6 +3,7 @@
 The base's velocity follows the accelerometer and is tied to the ground by feet that carry load: the point
 of such a foot that touches does not move, and lies at the floor's height (Bloesch et al. 2012,
 doi:10.15607/RSS.2012.VIII.003, as a fixed-interval smoother with the orientation found beforehand).
+Lengths, speeds and accelerations below are the Nao's; `BodySize` makes them those of the robot.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from sysid_btr.errors import LogError, ModelError
 from sysid_btr.floating_base.events import Event, find_fall, find_pickups, find_slips, usable
 from sysid_btr.floating_base.feet import Foot, base_body, force_columns, points_in_base, touching_bodies
 from sysid_btr.floating_base.orientation import smooth_orientation, up_in_base
+from sysid_btr.floating_base.size import BodySize, measure_size
 from sysid_btr.floating_base.smoothing import Tracks, smooth, smooth_joints
 from sysid_btr.mujoco_conventions import to_quaternion
 from sysid_btr.objectives.noise import noise_floor
@@ -49,7 +51,6 @@ SUNK = 0.0005
 UNSTEADY = 1.6
 """Factor on the standard deviations of velocities: motions jerk at impacts and rest between them, where the smoother
 takes them for alike. Calibrated on simulated walks."""
-GRAVITY = 9.81
 UNKNOWN = 5.0
 """m/s2, of the base's acceleration where nothing measures it."""
 
@@ -72,6 +73,7 @@ class BaseState:
     events : falls, pick-ups, slips.
     usable : (n,) samples outside of events.
     lost : what could not be found out for want of a sensor, in words.
+    size : of the robot.
     """
 
     time: FloatArray
@@ -93,6 +95,7 @@ class BaseState:
     events: tuple[Event, ...]
     usable: BoolArray
     lost: tuple[str, ...]
+    size: BodySize
 
     @property
     def tilt(self) -> FloatArray:
@@ -136,54 +139,20 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
     """
     lost: list[str] = []
     time = log.time - log.time[0]
-    feet = _feet(model)
-    measured = np.stack(
-        [
-            log.channels[f"position.{j}"] if log.has("position", j) else np.full(len(time), model.qpos0[a])
-            for j, a in zip(joints, addresses, strict=True)
-        ],
-        axis=1,
-    )
-    tracks = smooth_joints(time, measured)
+    feet, size = _feet(model), measure_size(model)
+    tracks = smooth_joints(time, _measured(model, log, joints, addresses), size.time(1.0))
     gyro = imu_columns(log, ("gyro_x", "gyro_y", "gyro_z"))
-    rates = smooth_joints(time, gyro)
-    up, up_std = vertical(log, gyro, lost)
+    rates = smooth_joints(time, gyro, size.time(1.0), derivative=1)
+    up, up_std = vertical(log, size, lost)
     gyro_std = float(np.mean([noise_floor(c).sigma for c in gyro.T]))
     rotation, rotation_std = smooth_orientation(time, gyro, up, gyro_std, up_std)
-    tilt = np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0))
-
-    here = points_in_base(model, feet, addresses, tracks.position)
-    ahead = points_in_base(model, feet, addresses, tracks.position + 1e-4 * tracks.velocity)
-    lowest, moving, spread = [], [], []
-    for foot, points, later in zip(feet, here, ahead, strict=True):
-        world = np.einsum("nij,nkj->nki", rotation, points)
-        height = world[..., 2] - foot.radius
-        share = np.exp(-(height - height.min(axis=1, keepdims=True)) / EDGE)
-        share /= share.sum(axis=1, keepdims=True)
-        relative = (later - points) / 1e-4 + np.cross(rates.position[:, None], points)
-        motion = np.einsum("nij,nkj->nki", rotation, relative)
-        lowest.append(np.sum(share * height, axis=1))
-        moving.append(np.einsum("nk,nki->ni", share, motion))
-        arm = np.linalg.norm(np.einsum("nk,nki->ni", share, world), axis=1)
-        noise = np.mean(tracks.velocity_std, axis=1) * 2 + np.mean(rates.position_std, axis=1)
-        spread.append(np.hypot(SLIDE_STD, arm * noise))
-    bottom = np.stack(lowest, axis=1)
+    soles = _soles(model, feet, addresses, tracks, rates, rotation, size)
     load = foot_loads(model, feet, log, lost)
-    contact = find_contacts(bottom, load)
+    contact = find_contacts(soles.bottom, load, size)
     force = _specific_force(model, log, rates, lost)
-    position, velocity = _follow(
-        time, rotation, force, contact, bottom, np.stack(moving, axis=1), np.stack(spread, axis=1)
-    )
-    speed = np.linalg.norm(velocity[0][:, None] + np.stack(moving, axis=1), axis=2)
-    events: list[Event] = []
-    fall = find_fall(log.time, tilt)
-    if load is not None:
-        events += find_pickups(log.time, load.sum(axis=1))
-        slip_std = np.hypot(np.stack(spread, axis=1), velocity[1].mean(axis=1)[:, None])
-        events += find_slips(log.time, speed, slip_std, contact)
-    if fall is not None:
-        events = [*(e for e in events if e.start < fall.start), fall]
-    found = tuple(sorted(events, key=lambda e: e.start))
+    position, velocity = _follow(time, rotation, force, contact, soles, size)
+    tilt = np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0))
+    events = _events(log.time, tilt, load, contact, soles, velocity, size)
     return BaseState(
         time=log.time,
         rotation=rotation,
@@ -194,35 +163,112 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
         joint_position=tracks.position,
         joint_velocity=tracks.velocity,
         rotation_std=rotation_std,
-        position_std=np.hypot(position[1], [0.0, 0.0, SUNK]),
+        position_std=np.hypot(position[1], [0.0, 0.0, size.length(SUNK)]),
         velocity_std=UNSTEADY * velocity[1],
         rate_std=UNSTEADY * rates.position_std,
         joint_position_std=tracks.position_std,
         joint_velocity_std=UNSTEADY * tracks.velocity_std,
         feet=tuple(f.name for f in feet),
         contact=contact,
-        events=found,
-        usable=usable(log.time, found),
+        events=events,
+        usable=usable(log.time, events, size),
         lost=tuple(lost),
+        size=size,
     )
 
 
-def find_contacts(bottom: FloatArray, load: FloatArray | None) -> BoolArray:
+def _measured(model: mujoco.MjModel, log: Log, joints: Sequence[str], addresses: IntArray) -> FloatArray:
+    """(n, j) joint positions; where the log has none, as the model stands."""
+    columns = [
+        log.channels[f"position.{j}"] if log.has("position", j) else np.full(len(log), model.qpos0[a])
+        for j, a in zip(joints, addresses, strict=True)
+    ]
+    return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Soles:
+    """What encoders, gyro and orientation say of the point of each foot that touches if the foot stands.
+
+    Attributes
+    ----------
+    bottom : (n, f) height above the base's origin, m (negative down).
+    moving : (n, f, 3) velocity against the base's origin, m/s in the world's axes.
+    std : (n, f) of that velocity, and of the foot over the ground.
+    """
+
+    bottom: FloatArray
+    moving: FloatArray
+    std: FloatArray
+
+
+def _soles(
+    model: mujoco.MjModel,
+    feet: Sequence[Foot],
+    addresses: IntArray,
+    tracks: Tracks,
+    rates: Tracks,
+    rotation: FloatArray,
+    size: BodySize,
+) -> _Soles:
+    moment = size.time(1e-4)
+    here = points_in_base(model, feet, addresses, tracks.position)
+    ahead = points_in_base(model, feet, addresses, tracks.position + moment * tracks.velocity)
+    noise = np.mean(tracks.velocity_std, axis=1) * 2 + np.mean(rates.position_std, axis=1)
+    bottom, moving, std = [], [], []
+    for foot, points, later in zip(feet, here, ahead, strict=True):
+        world = np.einsum("nij,nkj->nki", rotation, points)
+        height = world[..., 2] - foot.radius
+        share = np.exp(-(height - height.min(axis=1, keepdims=True)) / size.length(EDGE))
+        share /= share.sum(axis=1, keepdims=True)
+        relative = (later - points) / moment + np.cross(rates.position[:, None], points)
+        motion = np.einsum("nij,nkj->nki", rotation, relative)
+        bottom.append(np.sum(share * height, axis=1))
+        moving.append(np.einsum("nk,nki->ni", share, motion))
+        arm = np.linalg.norm(np.einsum("nk,nki->ni", share, world), axis=1)
+        std.append(np.hypot(size.speed(SLIDE_STD), arm * noise))
+    return _Soles(np.stack(bottom, axis=1), np.stack(moving, axis=1), np.stack(std, axis=1))
+
+
+def _events(
+    time: FloatArray,
+    tilt: FloatArray,
+    load: FloatArray | None,
+    contact: BoolArray,
+    soles: _Soles,
+    velocity: tuple[FloatArray, FloatArray],
+    size: BodySize,
+) -> tuple[Event, ...]:
+    """Falls, pick-ups and slips in their order, none after a fall."""
+    events: list[Event] = []
+    fall = find_fall(time, tilt)
+    if load is not None:
+        events += find_pickups(time, load.sum(axis=1), size)
+        speed = np.linalg.norm(velocity[0][:, None] + soles.moving, axis=2)
+        std = np.hypot(soles.std, velocity[1].mean(axis=1)[:, None])
+        events += find_slips(time, speed, std, contact, size)
+    if fall is not None:
+        events = [*(e for e in events if e.start < fall.start), fall]
+    return tuple(sorted(events, key=lambda e: e.start))
+
+
+def find_contacts(bottom: FloatArray, load: FloatArray | None, size: BodySize) -> BoolArray:
     """Which feet stand, (n, f).
 
     Parameters
     ----------
     bottom : (n, f) height of each foot's lowest point below the base, m (negative down).
     load : (n, f) force on each foot, any unit, or None.
+    size : of the robot.
     """
     above = bottom - bottom.min(axis=1, keepdims=True)
     if load is None:
-        return np.asarray(above < NEAR)
+        return np.asarray(above < size.length(NEAR))
     weight = float(np.median(load.sum(axis=1)))
     # single samples of a force sensor drop out while the foot stands
     padded = np.pad(load, ((1, 1), (0, 0)), mode="edge")
     held = np.maximum(padded[1:-1], np.minimum(padded[:-2], padded[2:]))
-    return np.asarray((held > LOADED * weight) & (above < LOWEST))
+    return np.asarray((held > LOADED * weight) & (above < size.length(LOWEST)))
 
 
 def lowest_points(model: mujoco.MjModel, feet: Sequence[Foot], base: BaseState) -> FloatArray:
@@ -271,16 +317,16 @@ def imu_columns(log: Log, names: tuple[str, ...]) -> FloatArray:
     return values
 
 
-def vertical(log: Log, gyro: FloatArray, lost: list[str]) -> tuple[FloatArray, FloatArray]:
+def vertical(log: Log, size: BodySize, lost: list[str]) -> tuple[FloatArray, FloatArray]:
     """Measured vertical in the base's frame, and its standard deviation."""
     if log.has("imu", "angle_x") and log.has("imu", "angle_y"):
         angles = imu_columns(log, ("angle_x", "angle_y"))
         sigma = float(np.mean([noise_floor(c).sigma for c in np.unwrap(angles, axis=0).T]))
         return up_in_base(angles[:, 0], angles[:, 1]), np.full(len(angles), max(sigma, 1e-4))
     force = imu_columns(log, ("acc_x", "acc_y", "acc_z"))
-    size = np.linalg.norm(force, axis=1)
+    felt = np.linalg.norm(force, axis=1)
     lost.append("no inclinometer: the vertical is the accelerometer's, more uncertain while the robot accelerates")
-    return force / size[:, None], TILT_STD + np.abs(size - GRAVITY) / GRAVITY + 0.05
+    return force / felt[:, None], TILT_STD + np.abs(felt - size.gravity) / size.gravity + 0.05
 
 
 def foot_loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list[str]) -> FloatArray | None:
@@ -321,17 +367,16 @@ def _follow(
     rotation: FloatArray,
     force: tuple[FloatArray, float] | None,
     contact: BoolArray,
-    bottom: FloatArray,
-    moving: FloatArray,
-    spread: FloatArray,
+    soles: _Soles,
+    size: BodySize,
 ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
     """Position and velocity of the base, each with its standard deviation, (n, 3)."""
-    n, feet = bottom.shape
+    n, feet = soles.bottom.shape
     step = np.diff(time)
     if force is None:
-        push, doubt = np.zeros((n - 1, 3)), np.full((n - 1, 3), UNKNOWN)
+        push, doubt = np.zeros((n - 1, 3)), np.full((n - 1, 3), size.acceleration(UNKNOWN))
     else:
-        world = np.einsum("nij,nj->ni", rotation, force[0]) - [0.0, 0.0, GRAVITY]
+        world = np.einsum("nij,nj->ni", rotation, force[0]) - [0.0, 0.0, size.gravity]
         doubt = np.hypot(force[1], 0.5 * np.abs(np.diff(world, axis=0)))
         push = 0.5 * (world[1:] + world[:-1])
     transition = np.tile(np.eye(2), (n - 1, 1, 1))
@@ -339,21 +384,19 @@ def _follow(
     drive = np.stack([0.5 * push * step[:, None] ** 2, push * step[:, None]], axis=2)
     reach = np.stack([0.5 * step**2, step], axis=1)
     process = doubt[:, :, None, None] ** 2 * (reach[:, None, :, None] * reach[:, None, None, :])
-    process = process + 1e-12 * np.eye(2)
+    process = process + 1e-12 * np.diag([size.length(1.0) ** 2, size.speed(1.0) ** 2])
     # measurements: for each foot the height of the base, and its velocity
     rows = np.array([[1.0, 0.0]] * feet + [[0.0, 1.0]] * feet)
-    measured = np.empty((n, 3, 2 * feet))
+    measured = np.zeros((n, 3, 2 * feet))
     variance = np.full((n, 3, 2 * feet), np.inf)
-    for f in range(feet):
-        measured[:, :, f] = 0.0
-        measured[:, 2, f] = -bottom[:, f]
-        variance[:, 2, f] = np.where(contact[:, f], HEIGHT_STD**2, np.inf)
-        measured[:, :, feet + f] = -moving[:, f]
-        variance[:, :, feet + f] = np.where(contact[:, f], spread[:, f] ** 2, np.inf)[:, None]
+    measured[:, 2, :feet] = -soles.bottom
+    variance[:, 2, :feet] = np.where(contact, size.length(HEIGHT_STD) ** 2, np.inf)
+    measured[:, :, feet:] = -np.swapaxes(soles.moving, 1, 2)
+    variance[:, :, feet:] = np.where(contact[:, None], soles.std[:, None] ** 2, np.inf)
     start = np.zeros((3, 2))
-    start[2, 0] = -bottom[0].min()
-    wide = np.tile(np.diag([0.05**2, 1.0]), (3, 1, 1))
-    wide[:2, 0, 0] = 1e-10
+    start[2, 0] = -soles.bottom[0].min()
+    wide = np.tile(np.diag([size.length(0.05) ** 2, size.speed(1.0) ** 2]), (3, 1, 1))
+    wide[:2, 0, 0] = 1e-10 * size.length(1.0) ** 2
     weighted = variance.copy()
     for _ in range(ROUNDS):
         found = smooth(transition, process, drive, rows, measured, weighted, (start, wide))

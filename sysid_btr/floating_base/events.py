@@ -1,4 +1,7 @@
-"""Stretches of a recording that no walking model should be fitted to: falls, pick-ups, slips."""
+"""Stretches of a recording that no walking model should be fitted to: falls, pick-ups, slips.
+
+Times and speeds below are the Nao's; `BodySize` makes them those of the robot.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.floating_base.size import BodySize
 
 FALLEN = 0.8
 """rad, tilt of the base from which no biped comes back: that is when it has fallen."""
@@ -55,26 +59,28 @@ def find_fall(time: FloatArray, tilt: FloatArray) -> Event | None:
     return Event("fall", moment, float(time[-1]))
 
 
-def find_pickups(time: FloatArray, load: FloatArray) -> tuple[Event, ...]:
+def find_pickups(time: FloatArray, load: FloatArray, size: BodySize) -> tuple[Event, ...]:
     """Stretches in which no foot carries anything; `load` is the total in any unit, (n,)."""
     weight = float(np.median(load[load > 0])) if np.any(load > 0) else 0.0
     if weight <= 0:
         return ()
-    return _stretches("pick-up", time, load < UNLOADED * weight, AIRBORNE)
+    return _stretches("pick-up", time, load < UNLOADED * weight, size.time(AIRBORNE))
 
 
-def find_slips(time: FloatArray, speed: FloatArray, std: FloatArray, loaded: BoolArray) -> tuple[Event, ...]:
+def find_slips(
+    time: FloatArray, speed: FloatArray, std: FloatArray, loaded: BoolArray, size: BodySize
+) -> tuple[Event, ...]:
     """Stretches in which a loaded foot moves over the ground; all (n, feet), m/s."""
-    moving = loaded & (speed > SLIP_SPEED) & (speed > CERTAIN * std)
-    return tuple(e for column in moving.T for e in _stretches("slip", time, column, SLIP_TIME))
+    moving = loaded & (speed > size.speed(SLIP_SPEED)) & (speed > CERTAIN * std)
+    return tuple(e for column in moving.T for e in _stretches("slip", time, column, size.time(SLIP_TIME)))
 
 
-def usable(time: FloatArray, events: tuple[Event, ...]) -> BoolArray:
+def usable(time: FloatArray, events: tuple[Event, ...], size: BodySize) -> BoolArray:
     """(n,) samples outside of all events."""
     keep = np.ones(len(time), dtype=bool)
     for event in events:
-        before = BEFORE if event.kind == "fall" else AROUND
-        after = np.inf if event.kind == "fall" else AROUND
+        before = size.time(BEFORE if event.kind == "fall" else AROUND)
+        after = np.inf if event.kind == "fall" else size.time(AROUND)
         keep &= (time < event.start - before) | (time > event.stop + after)
     return keep
 

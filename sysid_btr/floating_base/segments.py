@@ -12,6 +12,7 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError
 from sysid_btr.floating_base.estimate import BaseState
 from sysid_btr.floating_base.initial_states import respond
+from sysid_btr.floating_base.size import BodySize
 from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.noise import noise_floor
@@ -24,11 +25,11 @@ from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms
 
 WINDOW = 0.2
-"""s, length of a segment where nothing tells a better one."""
+"""s of a Nao (`BodySize`), as are all times here: length of a segment where nothing tells a better one."""
 WIDENED = 2.0
 """Factor on the stated standard deviations of an initial state: the smoother has used the segment's samples as well."""
 FASTEST = 0.002
-"""s, longest step with contacts: MuJoCo holds the time constant of a contact above twice the step."""
+"""s, longest step with contacts, in which legs, servos and impacts move little."""
 FEWEST = 4
 """Segments that a fitted log must have."""
 
@@ -134,8 +135,14 @@ def covered(segments: Windows, samples: int) -> BoolArray:
     return result
 
 
+def whole_step(period: float, longest: float) -> float:
+    """The longest step that divides a period, s; 3 % more than the longest that is asked for will do."""
+    step = period / max(int(np.ceil(0.97 * period / longest)), 1)
+    return longest if abs(step - longest) < 1e-9 * step else step
+
+
 def segment_numerics(
-    robot: Robot, log: Log, segments: Windows, threads: int = 0, simulator: str = MUJOCO
+    robot: Robot, log: Log, segments: Windows, size: BodySize, threads: int = 0, simulator: str = MUJOCO
 ) -> tuple[Numerics, float]:
     """Integrator and step for a log of a floating base, and the change in noise floors when the step is halved.
 
@@ -144,7 +151,7 @@ def segment_numerics(
     halved once at most.
     """
     step = float(np.median(np.diff(log.time)))
-    numerics = Numerics("RK4", step / max(int(np.ceil(step / FASTEST - 1e-9)), 1), simulator=simulator)
+    numerics = Numerics("RK4", step / round(step / whole_step(step, size.time(FASTEST))), simulator=simulator)
     few = segments.chosen(np.arange(0, len(segments), max(len(segments) // 16, 1)))
     error = np.inf
     for _ in range(2):
@@ -200,7 +207,7 @@ def choose_length(
     terms = Terms(parse_parameters(["mass:*", *gains], robot))
     values, step = terms.nominal, terms.scale
     found: list[tuple[float, FloatArray, float]] = []
-    for seconds in LENGTHS:
+    for seconds in map(base.size.time, LENGTHS):
         try:
             segments = segment_log(log, base, seconds)
         except LogError:
@@ -237,10 +244,11 @@ def segment_best(
 ) -> tuple[Windows, tuple[SegmentLength, ...]]:
     """Segments of the length that the part of a log before the first border asks for, and the lengths tried."""
     stop = int(np.searchsorted(log.time - log.time[0], borders[0])) if borders else len(log)
-    numerics = Numerics("implicitfast", FASTEST)
+    step = whole_step(float(np.median(np.diff(log.time))), base.size.time(FASTEST))
+    numerics = Numerics("implicitfast", step)
     lengths = choose_length(robot, log.window(0, stop), base.rows(0, stop), numerics, threads)
     good = [c.seconds for c in lengths if c.score >= lengths[0].score - NEARLY]
-    return segment_log(log, base, min(good, default=WINDOW), borders), lengths
+    return segment_log(log, base, min(good, default=base.size.time(WINDOW)), borders), lengths
 
 
 NEARLY = 0.25

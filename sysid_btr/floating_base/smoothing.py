@@ -14,7 +14,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.noise import noise_floor
 
 JERKS = np.logspace(0.5, 6.5, 13)
-"""Root of the spectral density of a joint's jerk that is tried, rad s^-2.5: from still to impacts."""
+"""Root of the spectral density of a joint's jerk that is tried, rad s^-2.5 with the s of a Nao:
+from still to impacts."""
 STRETCH = 1000
 """Samples on which the intensity is chosen."""
 
@@ -105,16 +106,19 @@ class Tracks:
     velocity_std: FloatArray
 
 
-def smooth_joints(time: FloatArray, measured: FloatArray) -> Tracks:
-    """Smoothed joint positions and velocities from encoders alone.
+def smooth_joints(time: FloatArray, measured: FloatArray, second: float = 1.0, *, derivative: int = 0) -> Tracks:
+    """Smoothed joint positions and velocities from encoders alone, or those of what a gyro measures.
 
     The model is a motion of white jerk, whose intensity is chosen for each joint by maximum likelihood.
 
     Parameters
     ----------
     time : (n,) s.
-    measured : (n, j) rad or m; NaN where missing.
+    measured : (n, j) rad or m, or their derivatives; NaN where missing.
+    second : s, in which the robot does what a Nao does in one.
+    derivative : order of the one that is measured.
     """
+    time, measured = time / second, measured * float(second**derivative)
     joints, grid = measured.shape[1], len(JERKS)
     sigma = np.array([max(noise_floor(column).sigma, 1e-7) for column in measured.T])
     step = np.diff(time)
@@ -146,4 +150,7 @@ def smooth_joints(time: FloatArray, measured: FloatArray) -> Tracks:
     best = np.argmax(trial.loglik.reshape(grid, joints), axis=0)
     found = run(measured, sigma, first, JERKS[best])
     deviation = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=2, axis2=3), 0.0))
-    return Tracks(found.mean[..., 0], found.mean[..., 1], deviation[..., 0], deviation[..., 1])
+    # an angle's derivative, in the robot's own s
+    value = float(second**-derivative)
+    mean, std = found.mean * value, deviation * value
+    return Tracks(mean[..., 0], mean[..., 1] / second, std[..., 0], std[..., 1] / second)

@@ -7,6 +7,7 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.floating_base.feet import base_body, touching_bodies, up_to_base
 from sysid_btr.floating_base.segments import FEWEST, segment_seconds
+from sysid_btr.floating_base.size import BodySize, measure_size
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.covariance import covariance, spread
 from sysid_btr.objectives.problem import ReplayProblem
@@ -83,9 +84,9 @@ def _phases(problem: ReplayProblem) -> IntArray | None:
     labels, found, first = [], False, 0
     for comparison in problem.episodes:
         replay, log = comparison.replay, comparison.replay.log
-        length = stride(log) if isinstance(replay, WindowReplay) else None
+        length = stride(log, measure_size(replay.model)) if isinstance(replay, WindowReplay) else None
         # what repeats in no stride is in pieces of its own
-        phase = (log.time - log.time[0]).astype(np.int64)
+        phase = ((log.time - log.time[0]) / (2 * comparison.stretch)).astype(np.int64)
         if length is not None and isinstance(replay, WindowReplay) and replay.windows is not None:
             found = True
             count = max(round(length / segment_seconds(replay.windows, log)), FEWEST)
@@ -97,13 +98,14 @@ def _phases(problem: ReplayProblem) -> IntArray | None:
     return np.concatenate(labels) if found else None
 
 
-def stride(log: Log) -> float | None:
+def stride(log: Log, size: BodySize) -> float | None:
     """Time after which the commands of a walk repeat, s; None where they do not."""
     step = float(np.median(np.diff(log.time)))
     moving = np.stack([c for n, c in log.channels.items() if n.startswith("command.")], axis=1)
     moving = np.nan_to_num(moving - np.nanmean(moving, axis=0))
     moving = moving[:, np.std(moving, axis=0) > STILL]
-    lags = np.arange(round(STRIDES[0] / step), min(round(STRIDES[1] / step), len(moving) // 2))
+    shortest, longest = (round(size.time(s) / step) for s in STRIDES)
+    lags = np.arange(shortest, min(longest, len(moving) // 2))
     if len(lags) < 3 or moving.shape[1] == 0:
         return None
     moving = moving / np.std(moving, axis=0)
@@ -114,7 +116,7 @@ def stride(log: Log) -> float | None:
 
 
 STRIDES = (0.3, 3.0)
-"""s, between which a stride lasts."""
+"""s of a Nao (`BodySize`), between which a stride lasts."""
 STILL = 0.01
 """rad, standard deviation of a command below which a joint stands still."""
 ALIKE = 0.8

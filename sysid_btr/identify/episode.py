@@ -145,9 +145,13 @@ class Episode(ABC):
     recording: Log
     scored: BoolArray
 
-    procedure: ClassVar[Procedure] = Procedure()
     warm_up: ClassVar[float] = 0.0
     """s after its beginning that are not scored."""
+
+    @property
+    def procedure(self) -> Procedure:
+        """How a fit goes about it."""
+        return Procedure()
 
     @cached_property
     def log(self) -> Log:

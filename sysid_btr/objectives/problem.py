@@ -21,6 +21,9 @@ from sysid_btr.simulation.subtrees import column_groups, parameter_subtrees, sub
 from sysid_btr.terms.base import Outputs, Parameter
 from sysid_btr.terms.model import Model, Terms
 
+BLOCK = 0.5
+"""Seconds; residuals closer than this are allowed to be correlated in standard errors."""
+
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
@@ -30,11 +33,13 @@ class Comparison:
     ----------
     replay, targets : what is simulated, and the channels it is compared with.
     marginal : where the replay starts from states that are known within an uncertainty, what that can do.
+    stretch : s within which residuals may be correlated.
     """
 
     replay: Replay
     targets: tuple[Target, ...]
     marginal: Marginal | None = None
+    stretch: float = BLOCK
 
     @cached_property
     def projections(self) -> tuple[Projection, ...]:
@@ -216,7 +221,7 @@ class ReplayProblem:
         labels, offset = [], 0
         for episode in self.episodes:
             time = episode.replay.log.time - episode.replay.log.time[0]
-            stretch = (time / BLOCK).astype(np.int64) + offset
+            stretch = (time / episode.stretch).astype(np.int64) + offset
             for target in episode.targets:
                 grid = np.broadcast_to(stretch[: len(target.mask), None], target.mask.shape)
                 labels.append(grid[target.mask])
@@ -368,7 +373,3 @@ class Conditional:
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         return self.whole.loss(self.complete(candidates))
-
-
-BLOCK = 0.5
-"""Seconds; residuals closer than this are allowed to be correlated in standard errors."""
