@@ -337,6 +337,20 @@ def test_close_names_the_effect_and_resumes(cli: Cli, bench: Path, tmp_path: Pat
     assert json.loads(again.out)["effects"] == result["effects"]
 
 
+def test_what_a_log_calls_its_columns_does_not_reach_the_terminal_as_commands(
+    cli: Cli, bench: Path, tmp_path: Path
+) -> None:
+    log = read_log(bench / "arm.parquet")
+    evil = "\x1b]0;owned\x07\x1b[2J\x9b31m"
+    columns = {**log.channels, f"position.{evil}": log.channels["position.hinge"]}
+    write_log(replace(log, channels=columns), tmp_path / "evil.parquet")
+    for verb in (("validate",), ("fit", "--fit", "kp:*", "--log")):
+        answer = cli(*verb, tmp_path / "evil.parquet", "--model", bench / "arm.xml")
+        shown = answer.out + answer.err
+        assert r"\x1b" in shown, "shown as an escape"
+        assert not set(shown) & set("\x1b\x07\x9b")
+
+
 def test_a_journal_is_not_continued_with_a_model_whose_included_file_changed(
     cli: Cli, bench: Path, tmp_path: Path
 ) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+from sysid_btr.display.printable import printable
+
 
 def remark(text: str) -> None:
     """Tell the user something that is no result."""
-    sys.stderr.write(text + "\n")
+    sys.stderr.write(printable(text) + "\n")
     sys.stderr.flush()
 
 

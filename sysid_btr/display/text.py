@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 from sysid_btr.display.changes import model_lines
+from sysid_btr.display.printable import printable
 from sysid_btr.units import si_all, with_digits_of
 
 if TYPE_CHECKING:
@@ -39,9 +40,15 @@ class Finding(Protocol):
 def console(stream: TextIO) -> Console:
     """A console that writes results; plain text of fixed width unless `stream` is a terminal."""
     from rich.console import Console
+    from rich.segment import Segment
+
+    class Screen(Console):
+        def render(self, *given: Any, **options: Any) -> Iterator[Segment]:
+            for text, style, control in super().render(*given, **options):
+                yield Segment(printable(text), style, control)
 
     width = None if stream.isatty() else PLAIN_WIDTH
-    return Console(file=stream, width=width, highlight=False, emoji=False, markup=False)
+    return Screen(file=stream, width=width, highlight=False, emoji=False, markup=False)
 
 
 def show(result: Mapping[str, Any], out: Console) -> None:
