@@ -34,6 +34,7 @@ TITLES = {
     "effects": "Effects",
     "machines": "Many machines",
     "limits": "Limits",
+    "architecture": "How it is built",
     "commands": "Commands",
     "reference": "API",
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
+import tomllib
 from collections.abc import Iterator
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -47,11 +48,29 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
 def test_every_command_of_a_page_exists(page: Path) -> None:
     verbs = typer.main.get_command(app).commands
     found = list(commands(page))
-    assert found or page.name == "limits.md"
+    assert found or page.name in ("limits.md", "architecture.md")
     for verb, flags in found:
         assert verb in verbs
         known = {option for parameter in verbs[verb].params for option in parameter.opts} | {"--help"}
         assert set(flags) <= known, (page.name, verb, flags)
+
+
+def test_the_picture_of_the_rooms_is_the_order_that_is_checked() -> None:
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]
+    page = (ROOT / "docs" / "guide" / "architecture.md").read_text()
+    rows = [re.split(r"\s{2,}", row.strip())[0] for row in re.findall(r"^    \S.*$", page, re.MULTILINE)]
+    assert rows == contract["layers"]
+
+
+def test_what_the_architecture_speaks_of_exists() -> None:
+    page = (ROOT / "docs" / "guide" / "architecture.md").read_text()
+    files = list((ROOT / "sysid_btr").rglob("*.py"))
+    code = "\n".join(file.read_text() for file in files)
+    spoken = re.findall(r"`([^`]+)`", page.replace("\n", " "))
+    for path in (s for s in spoken if s.endswith(".py")):
+        assert any(file.as_posix().endswith(f"/{path}") for file in (*files, *(ROOT / "tests").glob("*.py"))), path
+    for name in {s.partition("(")[0].rpartition(".")[2] for s in spoken if re.fullmatch(r"[\w.]+(\(.*\))?", s)}:
+        assert re.search(rf"\b{name}\b", code), name
 
 
 def test_every_name_of_the_package_that_a_page_uses_exists() -> None:
