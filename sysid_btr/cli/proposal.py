@@ -18,6 +18,7 @@ from sysid_btr.cli.study_file import toml
 from sysid_btr.errors import ModelError, UsageError
 from sysid_btr.io.log import CHANNELS, Log
 from sysid_btr.models.robot import Robot, joint_names, servo_actuators
+from sysid_btr.mujoco_conventions import FREE, slides
 from sysid_btr.objectives.noise import NoiseFloor, noise_floor
 from sysid_btr.objectives.targets import COMPARED, FITTED
 from sysid_btr.terms.grammar import parse_parameters
@@ -111,13 +112,13 @@ def _joints_seen(log: Log, robot: Robot, model: mujoco.MjModel) -> list[JointSee
     for name in joint_names(robot):
         if not log.has("position", name):
             continue
-        slides = int(model.joint(name).type[0]) == 2
+        sliding = slides(model, name)
         position = log.channels[f"position.{name}"]
         command = log.channels.get(f"command.{name}")
         found.append(
             JointSeen(
                 name,
-                "m" if slides else "rad",
+                "m" if sliding else "rad",
                 _spread(position),
                 np.nan if command is None else _spread(command),
                 noise_floor(position),
@@ -226,15 +227,13 @@ def _from_table(robot: Robot) -> Iterator[tuple[str, str]]:
 
 def _masses(model: mujoco.MjModel, moving: Sequence[str], free: bool) -> Iterator[tuple[str, str]]:
     """Masses of the bodies that hang on a joint that moved; a fixed base says nothing of its own."""
-    import mujoco
-
     for b in range(1, model.nbody):
         first, count = int(model.body_jntadr[b]), int(model.body_jntnum[b])
         own = [model.joint(j) for j in range(first, first + count)] if count else []
         if model.body_mass[b] <= 0 or not own:
             continue
         name, kilograms = model.body(b).name, float(model.body_mass[b])
-        if any(int(j.type[0]) == mujoco.mjtJoint.mjJNT_FREE for j in own):
+        if any(int(j.type[0]) == FREE for j in own):
             if free:
                 yield f"mass:{name}", f"{kilograms:.3g} kg in the model; the free base"
             continue

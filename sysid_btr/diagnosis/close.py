@@ -86,10 +86,10 @@ def close(
 
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
     """Effects that these logs could show at all, given mount and channels."""
-    free = any(episode.log.meta.mount == "free" for episode in study.train)
+    floating = any(episode.procedure.leaves_ground_error for episode in study.train)
     result = []
     for effect in effects:
-        if effect.needs == GROUND and not free:
+        if effect.needs == GROUND and not floating:
             continue
         if effect.needs == "enabled" and not any(_switched(episode.log) for episode in study.train):
             continue

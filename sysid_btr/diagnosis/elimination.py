@@ -65,7 +65,7 @@ def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[T
         spent += fewer.fitted.evaluations
         loss = (
             fewer.fitted.misfit_everywhere - trial.fitted.misfit_everywhere
-            if effect.passing
+            if effect.transient
             else fewer.fitted.misfit - trial.fitted.misfit
         )
         if not is_dispensable(rules, float(size[least]), float(size.max()), loss):

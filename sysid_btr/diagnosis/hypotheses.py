@@ -45,7 +45,7 @@ class Hypothesis:
     def initial_guesses(self) -> FloatArray:
         """Amounts (k, parameters) that a refit may begin from, those of the scan first."""
         kinds = len(self.effect.kinds)
-        amounts = [self.effect.ladder(a) for a in self.start.reshape(-1, kinds)]
+        amounts = [self.effect.initial_guesses(a) for a in self.start.reshape(-1, kinds)]
         return np.vstack([self.start, np.hstack(amounts)])
 
     def term(self, scales: Scales) -> Effect:

@@ -57,7 +57,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
                 state.before,
                 now,
                 t.fitted,
-                transient=t.hypothesis.effect.passing and bool(state.effects),
+                transient=t.hypothesis.effect.transient and bool(state.effects),
             )
         ]
         winner = choose(rules, now, worthy)

@@ -81,10 +81,10 @@ def choose(rules: Selection, before: Fitted, trials: Sequence[Trial]) -> Trial |
     in the fitted part wins where held-out data want nothing.
     """
     lasting = [t for t in trials if np.isfinite(t.fitted.holdout) and improves(rules, before, t.fitted)]
-    once = [t for t in trials if t.hypothesis.effect.passing and improves_once(rules, before, t.fitted)]
+    once = [t for t in trials if t.hypothesis.effect.transient and improves_once(rules, before, t.fitted)]
     if once:
         event = min(once, key=_misfit_everywhere)
-        others = [_misfit_everywhere(t) for t in lasting if not t.hypothesis.effect.passing]
+        others = [_misfit_everywhere(t) for t in lasting if not t.hypothesis.effect.transient]
         if _misfit_everywhere(event) < min(others, default=np.inf) - rules.simpler:
             return event
     if lasting:

@@ -20,6 +20,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError, UsageError
 from sysid_btr.excite.settings import MotionSettings
+from sysid_btr.mujoco_conventions import slides
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log, LogMeta
@@ -273,13 +274,13 @@ def find_motors(
         home = float(model.qpos0[model.joint(name).qposadr[0]])
         for joint in together:
             a, dof = actuators[joint], int(model.joint(joint).dofadr[0])
-            slides = int(model.joint(joint).type[0]) == 2
-            least, most = _room(joint, home, ranges, reference, motion.margin, slides)
+            sliding = slides(model, joint)
+            least, most = _room(joint, home, ranges, reference, motion.margin, sliding)
             if model.actuator_ctrllimited[a]:
                 least, most = max(least, model.actuator_ctrlrange[a, 0]), min(most, model.actuator_ctrlrange[a, 1])
             low, high = max(low, least), min(high, most)
-            fast = min(fast, VELOCITY[slides] if motion.velocity is None else motion.velocity)
-            sharp = min(sharp, ACCELERATION[slides] if motion.acceleration is None else motion.acceleration)
+            fast = min(fast, VELOCITY[sliding] if motion.velocity is None else motion.velocity)
+            sharp = min(sharp, ACCELERATION[sliding] if motion.acceleration is None else motion.acceleration)
             if model.actuator_forcelimited[a]:
                 torque = abs(model.actuator_gear[a, 0]) * float(np.abs(model.actuator_forcerange[a]).min())
                 sharp = min(sharp, TORQUE_SHARE * torque / float(inertia[dof, dof]))
@@ -302,7 +303,7 @@ def _room(
     ranges: Mapping[str, tuple[float, float]],
     reference: Log | None,
     margin: float,
-    slides: bool,
+    sliding: bool,
 ) -> tuple[float, float]:
     if joint in ranges:
         low, high = ranges[joint]
@@ -313,7 +314,7 @@ def _room(
         low, high = float(np.nanmin(sent)), float(np.nanmax(sent))
         if high > low:
             return low, high
-    return home - REACH[slides], home + REACH[slides]
+    return home - REACH[sliding], home + REACH[sliding]
 
 
 def as_log(

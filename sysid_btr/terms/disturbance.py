@@ -50,7 +50,7 @@ class ExternalDisturbance(Effect):
     name: ClassVar[str] = "external_disturbance"
     title: ClassVar[str] = "push from outside"
     held: ClassVar[tuple[str, ...]] = ("start", "duration")
-    passing: ClassVar[bool] = True
+    transient: ClassVar[bool] = True
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("torque", "Nm", 0.0, -50.0, 50.0, 0.1),

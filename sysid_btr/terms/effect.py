@@ -14,7 +14,7 @@ from sysid_btr.terms.scales import JointScale
 if TYPE_CHECKING:
     import mujoco
 
-LADDER = (0.3, 0.55, 1.0, 1.8, 3.0, 5.0)
+GUESSES = (0.3, 0.55, 1.0, 1.8, 3.0, 5.0)
 """Multiples of the scan's amount at which a refit may begin."""
 
 THRESHOLDS = (0.6, 0.72, 0.85, 1.0, 1.15, 1.3, 1.5)
@@ -43,7 +43,7 @@ class Effect(Term):
     main : kind whose value says how large the effect is.
     steps : amounts the scan tries, in units of the kind's scale; more than one where the response bends.
     everywhere : whether it may well be alike at all places, so that the scan asks for that too.
-    passing : whether it happens at some moment, so that held-out data may hold nothing of it.
+    transient : whether it happens at some moment, so that held-out data may hold nothing of it.
     includes : simpler effects that are special cases of this one.
     yields_to : effects that are named instead of this one where a log cannot tell them apart.
     held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
@@ -60,7 +60,7 @@ class Effect(Term):
     details: ClassVar[tuple[str, ...]] = ()
     steps: ClassVar[tuple[float, ...]] = (2.0,)
     everywhere: ClassVar[bool] = False
-    passing: ClassVar[bool] = False
+    transient: ClassVar[bool] = False
     includes: ClassVar[tuple[str, ...]] = ()
     yields_to: ClassVar[tuple[str, ...]] = ()
 
@@ -96,7 +96,7 @@ class Effect(Term):
         return self
 
     @classmethod
-    def ladder(cls, values: FloatArray) -> FloatArray:
+    def initial_guesses(cls, values: FloatArray) -> FloatArray:
         """Amounts (k, kinds) that a refit may begin from, given what a linear scan says (kinds,).
 
         The response of friction, play, limits and delays bends: the scan's amount can be far off.
@@ -104,7 +104,7 @@ class Effect(Term):
         if cls.signed:
             return values[None]
         threshold = cls.kinds[cls.main].name in cls.held
-        rungs = np.array(THRESHOLDS if threshold else LADDER)
+        rungs = np.array(THRESHOLDS if threshold else GUESSES)
         anchor = 0.0 if threshold else cls.kinds[cls.main].nominal
         result = np.tile(values, (len(rungs), 1))
         result[:, cls.main] = anchor + rungs * (values[cls.main] - anchor)

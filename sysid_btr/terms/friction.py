@@ -156,7 +156,7 @@ class StribeckFriction(Effect):
         )
 
     @classmethod
-    def ladder(cls, values: FloatArray) -> FloatArray:
+    def initial_guesses(cls, values: FloatArray) -> FloatArray:
         """Sum of both, share of the part that falls, and velocity: stick-slip has many local minima."""
         total = float(values[0] + values[1])
         return np.array(

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 from sysid_btr.errors import UsageError
+from sysid_btr.mujoco_conventions import SLIDE
 from sysid_btr.terms.base import Scope, Term, parameter_of
 from sysid_btr.terms.library import declarable
 from sysid_btr.terms.scales import SLIDE_UNITS, Scales, largest_scale
@@ -169,10 +170,7 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
 
 
 def _slides(model: mujoco.MjModel, place: str) -> bool:
-    import mujoco
-
-    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
-    return any(model.joint(i).name == place and model.jnt_type[i] == slide for i in range(model.njnt))
+    return any(model.joint(i).name == place and model.jnt_type[i] == SLIDE for i in range(model.njnt))
 
 
 def _own_bounds(

@@ -230,7 +230,7 @@ class Cogging(Effect):
         return ((size, 0.0, number), (0.0, size, number))
 
     @classmethod
-    def ladder(cls, values: FloatArray) -> FloatArray:
+    def initial_guesses(cls, values: FloatArray) -> FloatArray:
         """Nearby numbers of teeth in all phases: a period off over the range of motion is a minimum of its own."""
         sine, cosine, number = values
         size, phase = np.hypot(sine, cosine), np.arctan2(cosine, sine)
