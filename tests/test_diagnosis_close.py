@@ -20,6 +20,7 @@ from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.trials import attempt
 from sysid_btr.estimators import Journal
 from sysid_btr.identify.refit import judge
+from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
@@ -118,6 +119,27 @@ def test_backlash_is_found_at_its_joint() -> None:
     assert (effect.effect, effect.where) == ("backlash", tuple(planted["where"])), found.message
     assert amount_is(effect, 0, planted["parameters"]["play"]), effect
     assert over_floor(found) <= 1.3
+
+
+def pendulum_log(parameters: dict[str, float], seconds: float = 3.0) -> Log:
+    """A pendulum with some parameters, under noise."""
+    motion = toys.swing(seconds=seconds)
+    run = replay_log(toys.pendulum(), motion, parameters, numerics=Numerics("RK4", 0.00125))
+    measured = run.channels["position.arm"] + np.random.default_rng(1).normal(0.0, 4e-4, len(run))
+    return replace(motion, channels={**motion.channels, "position.arm": measured})
+
+
+def test_what_is_declared_as_a_rule_is_found_where_it_is_asked_for() -> None:
+    study = make_study(toys.pendulum(), [pendulum_log({"kp:arm": 0.85})], numerics=toys.FINE)
+    effect = only_effect(close(study, ["armature:arm"], effects=("kp", "delay", "frictionloss")))
+    assert (effect.effect, effect.where) == ("kp", ("arm",))
+    assert amount_is(effect, 0, 0.85)
+
+
+def test_a_joint_that_a_declared_term_has_split_is_not_split_again() -> None:
+    study = make_study(toys.pendulum(), [pendulum_log({"frictionloss:arm": 0.1})], numerics=toys.FINE)
+    found = close(study, ["joint_compliance:arm"], effects=("backlash", "joint_compliance", "coulomb_friction"))
+    assert only_effect(found).effect == "coulomb_friction"
 
 
 def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from toys import LEG, LEG_JOINTS, leg, make_log, position, robot_from_xml, run, swing, with_spec
 
+from sysid_btr.terms.effect import DofEffect
+from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, ViscousDamping
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.inertial import Armature
 
 LOG = swing(LEG_JOINTS, seconds=0.6)
 EXACT = 1e-9
@@ -99,6 +102,15 @@ def test_mass_takes_the_inertia_along_and_inertia_leaves_the_mass() -> None:
 )
 def test_absolute_fields_start_from_the_model(field: str, place: str, value: float) -> None:
     assert parse_parameters([f"{field}:{place}"], leg())[0].parameters[0].nominal == pytest.approx(value)
+
+
+@pytest.mark.parametrize("cls", [CoulombFriction, ViscousDamping, QuadraticDamping, Armature])
+def test_a_models_own_value_is_the_value_that_a_change_leads_to(cls: type[DofEffect]) -> None:
+    (own,) = parse_parameters([f"{cls.field}:knee"], leg())
+    value = own.parameters[0].nominal + 0.03
+    changed = position(leg(), LOG, [cls(places=("knee",))], [0.03])
+    np.testing.assert_allclose(position(leg(), LOG, [own], [value]), changed, rtol=0, atol=1e-12)
+    assert np.abs(changed - position(leg(), LOG)).max() > 1e-4
 
 
 def test_a_gear_does_not_change_what_a_force_limit_is() -> None:

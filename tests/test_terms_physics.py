@@ -512,15 +512,16 @@ def test_a_soft_gear_twists_in_proportion_to_its_torque(effect: type[Effect]) ->
     assert rest(effect, [softness], seconds=6.0) == pytest.approx(q, abs=2e-5)
 
 
+@pytest.mark.parametrize(("name", "value"), [("damping", 0.4), ("viscous_damping", 0.4 - DAMPING)])
 @pytest.mark.parametrize("effect", [Backlash, JointCompliance])
-def test_a_fitted_damping_acts_once_when_a_gear_has_two_sides(effect: type[Effect]) -> None:
-    """The declared damping of the joint is in place of the model's own, with and without the effect."""
+def test_a_fitted_damping_acts_once_when_a_gear_has_two_sides(effect: type[Effect], name: str, value: float) -> None:
+    """In place of the joint's own or added to it, it acts where the joint's own does, with and without the effect."""
     log = swing()
-    damping = parse_parameters(["damping:arm"], pendulum())
+    damping = parse_parameters([f"{name}:arm"], pendulum())
     built = with_spec(pendulum(), lambda s: setattr(s.joint("arm"), "damping", [0.4, 0, 0]))
     small = [0.02] * len(effect.kinds)
     np.testing.assert_allclose(
-        position(pendulum(), log, [*damping, at_arm(effect)], [0.4, *small]),
+        position(pendulum(), log, [*damping, at_arm(effect)], [value, *small]),
         position(built, log, [at_arm(effect)], small),
         atol=1e-9,
     )

@@ -154,7 +154,7 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
 def _perturbations(
     state: State, library: Library, problem: ReplayProblem, residual: FloatArray, rules: Selection
 ) -> list[Perturbation]:
-    """What a scan asks for: an effect already at a location is not, as it is refitted with everything else."""
+    """What a scan asks for: a term already at a location is not, as it is refitted with everything else."""
     study = state.study
     places = {
         "joint": joint_names(study.robot),
@@ -167,8 +167,9 @@ def _perturbations(
         asked = [q for q in asked if len(q.places) > 1 or q.effect.scope == "robot"]
     else:
         asked += proposals(study, problem, state.fitted.model.values, residual, library)
-    present = {(type(e), p) for e in state.effects for p in e.places}
-    split = {p for e in state.effects if e.structural for p in e.places}
+    terms = state.fitted.model.terms
+    present = {(type(t), p) for t in terms if t.numbers == t.kinds for p in t.places}
+    split = {p for t in terms if t.structural for p in t.places}
     return [
         q
         for q in asked

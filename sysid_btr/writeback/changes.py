@@ -239,8 +239,8 @@ def describe(part: Part, place: str | None = None) -> str:
 
 def called(part: Part) -> str:
     """Name of a term, with its variant."""
-    variant = part.term.variant
-    return f"{part.term.called} ({variant})" if variant else part.term.called
+    name, variant = part.term.called, part.term.variant
+    return f"{name} ({variant})" if variant and not name.endswith(f".{variant}") else name
 
 
 def amounts(part: Part, place: str) -> str:
