@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -138,6 +139,19 @@ def test_figures_are_drawn_on_axes(leg: Posterior) -> None:
     assert png(corner[0, 0].figure).startswith(b"\x89PNG")
     assert len(plot_trace(leg)) >= count
     assert len(plot_bands(leg)) == 2 * min(len(leg.bands), 3)
+
+
+def test_the_posterior_of_a_single_parameter_is_drawn_with_the_fit() -> None:
+    from sysid_btr.report.posterior import plot_corner
+
+    draws = np.random.default_rng(0).normal(1.2, 0.1, size=(400, 1))
+    single = SimpleNamespace(
+        estimates=[None],
+        sample=SimpleNamespace(flat=draws, names=("mass:arm",)),
+        fit=SimpleNamespace(values=np.array([1.2])),
+    )
+    [[axis]] = plot_corner(single)
+    assert any(set(line.get_xdata()) == {1.2} for line in axis.lines)
 
 
 # --- the command line -------------------------------------------------------------------------------------

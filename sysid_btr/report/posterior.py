@@ -54,12 +54,13 @@ def plot_corner(posterior: Posterior, figure: Figure | None = None) -> FloatArra
     low = draws.min(axis=0)
     spread = np.maximum(np.ptp(draws, axis=0), 1e-12 * np.maximum(np.abs(draws).max(axis=0), 1e-300))
     panels = list(zip(posterior.fit.values[which], low, spread, strict=True))
+    # a line outside the panel only stretches it
+    truths = [v if a - s < v < a + 2 * s else None for v, a, s in panels]
     corner.corner(
         draws,
         fig=figure,
         labels=[posterior.sample.names[j] for j in which],
-        # a line outside the panel only stretches it
-        truths=[v if a - s < v < a + 2 * s else None for v, a, s in panels],
+        truths=truths if len(which) > 1 else None,  # corner cannot draw them over a single panel
         range=[(float(a - 0.02 * s), float(a + 1.02 * s)) for _, a, s in panels],
         quantiles=[0.025, 0.5, 0.975],
         truth_color=PLAIN,
@@ -71,6 +72,8 @@ def plot_corner(posterior: Posterior, figure: Figure | None = None) -> FloatArra
         no_fill_contours=True,  # the base fill is white
         label_kwargs={"fontsize": 8},
     )
+    if len(which) == 1 and truths[0] is not None:
+        figure.axes[0].axvline(truths[0], color=PLAIN)
     axes: Any = np.array(figure.axes).reshape(len(which), len(which))
     for axis in figure.axes:
         axis.tick_params(labelsize=6)
