@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sysid_btr.io import Log, LogMeta, Problem, validate_file, write_log
+from sysid_btr.io import Log, LogMeta, Problem, read_log, validate_file, write_log
 
 JOINTS = ("HeadYaw", "LKneePitch", "RKneePitch", "LHipRoll", "RHipRoll")
 META = {"schema": 1, "robot": "toy", "mount": "free", "sample_period": 0.01}
@@ -367,9 +367,20 @@ def test_time_column_missing_or_named_otherwise(good_log: Log, tmp_path: Path) -
 
 
 def test_time_of_another_type(good_log: Log, tmp_path: Path) -> None:
-    stamps = np.datetime64("2020-01-01", "us") + (good_log.time * 1e6).astype(np.int64)
-    path = write_raw(tmp_path / "a.parquet", {"time": stamps, **good_log.channels})
-    assert "timestamp[us]" in only(validate_file(path), "time.type").message
+    path = write_raw(tmp_path / "a.parquet", {"time": [f"{t} s" for t in good_log.time], **good_log.channels})
+    assert "string" in only(validate_file(path), "time.type").message
+
+
+@pytest.mark.parametrize(("unit", "tick"), [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
+@pytest.mark.parametrize("dated", [True, False])
+def test_a_clock_that_counts_in_whole_units_is_read(
+    good_log: Log, tmp_path: Path, unit: str, tick: float, dated: bool
+) -> None:
+    stamps = np.datetime64("2026-01-01", unit) + np.round(good_log.time / tick).astype(np.int64)
+    ticks = stamps if dated else stamps.astype(np.int64)
+    path = write_raw(tmp_path / "a.parquet", {"time": ticks, **good_log.channels})
+    log = read_log(path)
+    np.testing.assert_allclose(log.time, good_log.time - good_log.time[0], atol=1e-9)
 
 
 def test_time_backwards(good_log: Log, check) -> None:

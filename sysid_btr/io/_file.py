@@ -305,8 +305,9 @@ def _log(table: pa.Table, meta: LogMeta, path: Path, problems: list[Problem]) ->
 def _time(
     columns: Mapping[str, pa.ChunkedArray], meta: LogMeta, n: int, problems: list[Problem]
 ) -> FloatArray | None:
-    if "time" in columns and _is_numeric(columns["time"].type):
-        return _floats(columns["time"])
+    found = _seconds(columns["time"], meta) if "time" in columns else None
+    if found is not None:
+        return found
     if "time" in columns:
         message, remedy = (
             f"the column holds {columns['time'].type}, not a number of seconds",
@@ -327,6 +328,33 @@ def _time(
         )
     # With the nominal period the other columns can still be checked in the same pass.
     return None if meta.sample_period is None else np.arange(n, dtype=np.float64) * meta.sample_period
+
+
+def _seconds(column: pa.ChunkedArray, meta: LogMeta) -> FloatArray | None:
+    """A clock in seconds: floats as they are, timestamps since the first of them; None for anything else.
+
+    Whole numbers are seconds, too, unless their steps are the sample period in milli-, micro- or nanoseconds.
+    """
+    import pyarrow as pa
+
+    if pa.types.is_timestamp(column.type):
+        ticks, unit = column.cast(pa.int64()), {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[column.type.unit]
+    elif pa.types.is_integer(column.type) and meta.sample_period is not None:
+        ticks, unit = column, _unit_of(column, meta.sample_period)
+    else:
+        return _floats(column) if _is_numeric(column.type) else None
+    if ticks.null_count or not len(ticks):
+        return _floats(ticks) * unit
+    whole = ticks.to_numpy().astype(np.int64)
+    # differences of whole numbers are exact, however far away the origin is
+    return np.asarray((whole - whole[0]).astype(np.float64) * unit) if unit != 1.0 else _floats(ticks)
+
+
+def _unit_of(column: pa.ChunkedArray, period: float) -> float:
+    """Seconds of one tick: that by which the steps are the sample period; 1 if none is."""
+    steps = np.diff(column.drop_null().to_numpy())
+    middle = float(np.median(steps)) if len(steps) else 0.0
+    return next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if 0.5 * period < middle * unit < 2 * period), 1.0)
 
 
 def _episode(columns: Mapping[str, pa.ChunkedArray], n: int, problems: list[Problem]) -> IntArray:
@@ -366,7 +394,7 @@ def _floats(column: pa.ChunkedArray) -> FloatArray:
 
     if pa.types.is_boolean(column.type):
         column = column.cast(pa.int8())
-    values: FloatArray = column.cast(pa.float64()).to_numpy().astype(np.float64, copy=True)
+    values: FloatArray = column.cast(pa.float64(), safe=False).to_numpy().astype(np.float64, copy=True)
     return values
 
 
