@@ -289,6 +289,23 @@ def test_what_has_no_weight_does_not_walk() -> None:
         measure_size(spec.compile())
 
 
+@pytest.mark.parametrize("length", [1.0, 3.0, 1 / 3])
+def test_what_counts_as_a_flight_a_slip_and_a_stance_grows_with_the_robot(length: float) -> None:
+    pace, size = Scale(length).time, replace(NAO, leg=length * NAO.leg)
+    time = pace * np.arange(0, 3, 0.01)
+    load = np.full(len(time), 40.0)
+    load[50:64] = 0.0  # 0.13 s
+    load[100:118] = 0.0
+    assert [e.start for e in find_pickups(time, load, size)] == pytest.approx([pace * 1.0])
+    speed = np.full((len(time), 1), 0.11 * pace)
+    speed[50:54] = 0.13 * pace  # for 0.03 s
+    speed[100:108] = 0.13 * pace
+    slips = find_slips(time, speed, np.full((len(time), 1), 1e-3), np.ones((len(time), 1), dtype=bool), size)
+    assert [e.start for e in slips] == pytest.approx([pace * 1.0])
+    bottom = length * np.array([[-0.3, -0.287], [-0.3, -0.283]])  # 13 and 17 mm above the other
+    assert find_contacts(bottom, np.full((2, 2), 20.0), size).tolist() == [[True, True], [True, False]]
+
+
 WALKS = {
     "walk": plain_walk,
     "fall": pushed_over,

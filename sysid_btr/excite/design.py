@@ -428,11 +428,11 @@ def design(
     meta = LogMeta(robot=robot.name) if reference is None else reference.meta
     first = as_log(family, start, robot, times=1, like=meta)
     experiment = prepare(robot, parameters, find_sensors(robot, reference, noise), first, threads=threads)
-    if reference is None:
-        compared, before = "the initial motion", expect(experiment.problem(as_log(family, start, robot)))
-    else:
-        compared = reference.path.name if reference.path else "the reference log"
-        before = expect(experiment.of_reference(reference, family.clock.seconds))
+    before = expect(
+        experiment.problem(as_log(family, start, robot))
+        if reference is None
+        else experiment.of_reference(reference, family.clock.seconds)
+    )
     choice = Excitation(cheap(experiment, first), family, criterion, before.std, start)
     with search_context():
         result = (estimator or SEARCH).fit(
@@ -451,11 +451,17 @@ def design(
         log=log,
         reference=before,
         designed=expect(problem),
-        compared_with=compared,
+        compared_with=_called(reference),
         result=result,
         beyond=_beyond(robot, problem.episodes[0].replay),
         seconds=perf_counter() - began,
     )
+
+
+def _called(reference: Log | None) -> str:
+    if reference is None:
+        return "the initial motion"
+    return reference.path.name if reference.path else "the reference log"
 
 
 def configured(robot: Robot, reference: Log | None) -> Robot:

@@ -15,7 +15,6 @@ from sysid_btr.io.log import Log
 
 _STEP = 0.01  # s; lags are searched no finer than this
 _NORMAL_LAG = 0.25  # s; servo lag, delay and filters together
-_QUICK_LAG = 0.1  # s
 _MIN_SAMPLES = 30
 
 

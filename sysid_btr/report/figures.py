@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.mujoco_conventions import slides
-from sysid_btr.report.style import FOUND, MODEL_COLOURS, PLAIN, SHADE, faint, ink, new_figure, on_page
+from sysid_btr.report.style import FOUND, MODEL_COLOURS, PLAIN, SHADE, faint, ink, new_figure
 from sysid_btr.terms.model import Model
 from sysid_btr.units import CHANNEL_UNITS, si_all
 
@@ -150,11 +150,6 @@ def plot_overlay(traces: Sequence[Trace], figure: Figure | None = None) -> Any:
         for axis in axes[-1]:
             axis.set_xlabel("time (s)")
     return axes
-
-
-def draw_overlay(traces: Sequence[Trace], *, dark: bool = False) -> bytes:
-    """`plot_overlay` as a PNG file, for a light or a dark page."""
-    return on_page(lambda: figure_of(plot_overlay(traces)), dark=dark)
 
 
 LAGS = 1.0
