@@ -650,6 +650,18 @@ def test_effects_read_back_too(own: Path, out: Folder) -> None:
     assert len(unused) == 5
 
 
+def test_what_is_declared_in_part_or_as_the_models_own_value_reads_back_as_it_was(own: Path, out: Folder) -> None:
+    expressions = ["backlash.play:knee", "stiffness:*=shared", "delay:hip", "foot_friction:ankle", "joint_spring:hip"]
+    model = declared(own, expressions[:4], [0.02, 0.3, 0.01, 0.6])
+    out.write("params.json", json.dumps(params_of(model), default=list))
+    read = read_params(out.path, model.study.robot).model
+    assert read.terms == model.model.terms
+    assert read.values.tolist() == model.model.values.tolist()
+    assert {c.line for c in draft(model).changes} >= {"joint hip stiffness 0 -> 0.3"}
+    with pytest.raises(UsageError, match="joint_spring:hip is already declared"):
+        parse_parameters(expressions, model.study.robot)
+
+
 def test_parameter_files_that_do_not_fit_are_refused(own: Path, out: Folder) -> None:
     content = params_of(declared(own, ["kp:hip", "mass:knee"], [1.1, 1.2]))
     content["modifiers"] = [{**e, "where": ["elbow"]} for e in content["modifiers"]]

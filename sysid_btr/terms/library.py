@@ -110,11 +110,11 @@ def declarable(more: Mapping[str, type[Term]]) -> dict[str, type[Term]]:
 
     `more` are those that one robot alone has.
     """
-    terms = all_terms()
-    table = {cls.field: cls for cls in terms if cls.field}
-    for cls in terms:
-        for name in (cls.name, *cls.also, *([f"{cls.name}.{cls.variant}"] if cls.variant else [])):
-            table.setdefault(name, cls)
+    table: dict[str, type[Term]] = {}
+    for cls in all_terms():
+        for name in (cls.field, cls.name, *cls.also, f"{cls.name}.{cls.variant}"):
+            if name and not name.endswith("."):
+                table.setdefault(name, cls)
     return {**table, **more}
 
 
