@@ -382,7 +382,7 @@ def _blows(chain: _Chain, values: FloatArray) -> FloatArray:
     import mujoco
 
     steps, states = chain.steps, chain.states
-    model, index = candidate_model(steps, values), steps.index
+    model, index = _written(steps, values).candidate(0), steps.index
     data = mujoco.MjData(model)
     place, motion = steps._free_joint
     order = np.concatenate([motion + np.arange(6), index.dof])
@@ -400,11 +400,6 @@ def _blows(chain: _Chain, values: FloatArray) -> FloatArray:
         mujoco.mj_solveM(model, data, blow, jacobian.reshape(blow.shape))
         result[k, rows] = blow.T[order]
     return result
-
-
-def candidate_model(replay: WindowReplay, values: FloatArray) -> mujoco.MjModel:
-    """The compiled model with a candidate's numbers in it."""
-    return _written(replay, values).candidate(0)
 
 
 def difference(a: Windows, b: Windows) -> FloatArray:
