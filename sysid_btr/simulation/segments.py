@@ -23,7 +23,7 @@ from sysid_btr.terms.base import Fields, Outputs
 SIMULATIONS = 96
 """Simulations of one batch."""
 LEAD = 0.25
-"""s of commands before a window that reach into it when they are delayed."""
+"""s of commands before a window that reach into it when they are delayed, by a bus, whatever the robot's size."""
 BASE = 12
 """Numbers of a free base in a state: position, rotation, velocity, angular velocity, three each."""
 
