@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -135,6 +136,16 @@ def test_a_force_limit_can_be_above_the_nominal_one() -> None:
     robot = with_spec(leg(), lambda s: limit_force(s, 0.4))
     terms = parse_parameters(["force_limit:knee"], robot)
     np.testing.assert_allclose(position(robot, LOG, terms, [0.8]), position(leg(), LOG, terms, [0.8]))
+
+
+def test_a_limit_is_none_at_its_neutral_value_and_one_within_bounds_that_a_user_gives() -> None:
+    robot = replace(leg(), bounds={"force_limit": (0.1, 0.4)})
+    (limit,) = parse_parameters(["force_limit:knee"], robot)
+    np.testing.assert_array_equal(position(robot, LOG, [limit]), position(robot, LOG))
+    most = position(robot, LOG, [limit], [limit.parameters[0].upper])
+    np.testing.assert_allclose(most, position(with_spec(robot, lambda s: limit_force(s, 0.4)), LOG), atol=EXACT)
+    (speed,) = parse_parameters(["speed_torque_limit.no_load_speed:knee"], robot)
+    np.testing.assert_array_equal(position(robot, LOG, [speed], [0.5]), position(robot, LOG))
 
 
 def test_constant_force_acts_in_the_direction_of_the_joint() -> None:

@@ -299,10 +299,13 @@ class Term:
             shaped = whole
         return np.broadcast_to(shaped, (len(values), len(self.places), shaped.shape[2]))
 
-    def spread_parameters(self, kind: int) -> tuple[Parameter, ...]:
-        """The parameter of one kind for each place."""
-        own = self.parameters[kind :: len(self.numbers)]
-        return own * len(self.places) if len(own) == 1 else own
+    def neutral_of(self, kind: int) -> FloatArray:
+        """(places,) neutral value of one kind."""
+        fixed = self.fixed[kind] if self.fixed else None
+        if fixed is not None:
+            return np.full(len(self.places), fixed)
+        own = self.parameters[self.numbers.index(self.kinds[kind]) :: len(self.numbers)]
+        return np.broadcast_to(np.array([p.nominal for p in own]), (len(self.places),))
 
     def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
         """The model's own values (m, places) under this term's numbers: those instead, or those added."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class TorqueLimit(Effect):
     """A servo that cannot give more than a certain torque.
 
-    Native: `actuator_forcerange`. Neutral at the upper bound. A further limit stays within the model's own; as the
+    Native: `actuator_forcerange`. No limit at the neutral value. A further limit stays within the model's own; as the
     model's own, of both signs, it takes that one's place.
     """
 
@@ -58,8 +58,8 @@ class TorqueLimit(Effect):
         bound = values[:, :, 0] / np.abs(batch.model.actuator_gear[ids, 0])
         was, low, high = limited[:, ids].astype(bool), ranges[:, ids, 0], ranges[:, ids, 1]
         inside = was & (not self.absolute)
-        on = values[:, :, 0] < np.array([p.upper for p in self.spread_parameters(0)])
-        on |= was & self.absolute
+        none = self.neutral_of(0)
+        on = was | (values[:, :, 0] != none) if self.absolute else values[:, :, 0] < none
         ranges[:, ids, 0] = np.where(on, np.where(inside, np.maximum(-bound, low), -bound), low)
         ranges[:, ids, 1] = np.where(on, np.where(inside, np.minimum(bound, high), bound), high)
         limited[:, ids] = was | on
@@ -70,7 +70,7 @@ class TorqueLimit(Effect):
 class SpeedTorqueLimit(Effect):
     """A motor whose largest torque falls with speed: stall torque at rest, none at the no-load speed.
 
-    Law: -stall (1 + v / w0) <= torque <= stall (1 - v / w0), never beyond +-stall; none at its bound.
+    Law: -stall (1 + v / w0) <= torque <= stall (1 - v / w0), never beyond +-stall; none at its neutral value.
     """
 
     name: ClassVar[str] = "speed_torque_limit"
@@ -101,8 +101,7 @@ class SpeedTorqueLimit(Effect):
         return tuple(((a * peak, b * speed),) for a in (1.2, 0.8, 0.5) for b in (1.2, 2.5))
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        most = np.array([p.upper for p in self.spread_parameters(0)])
-        stall = np.where(values[:, :, 0] >= most, np.inf, values[:, :, 0])
+        stall = np.where(values[:, :, 0] >= self.neutral_of(0), np.inf, values[:, :, 0])
         speed = values[:, :, 1]
         fraction = step.qvel[:, index] / speed
         high = stall * np.maximum(1 - np.maximum(fraction, 0), 1e-9)
@@ -142,8 +141,8 @@ class SlewLimit(Effect):
         shaped = np.array(command)
         columns = batch.index.of(self.places)
         wanted = shaped[:, :, columns]
-        # at the upper bound there is no limit: a held command jumps faster than the motion it describes
-        off = values[:, :, 0] >= np.array([p.upper for p in self.spread_parameters(0)])
+        # at the neutral value there is no limit: a held command jumps faster than the motion it describes
+        off = values[:, :, 0] >= self.neutral_of(0)
         most = np.where(off, np.inf, values[:, :, 0] * batch.timestep)
         if off.all():
             return shaped
