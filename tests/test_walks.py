@@ -434,7 +434,7 @@ def test_a_walk_of_another_size_poses_the_same_problem(length: float) -> None:
         assert isinstance(mine, FloatingEpisode)
         assert isinstance(theirs, FloatingEpisode)
         assert np.array_equal(mine.segments.rows, theirs.segments.rows)
-        assert len(mine.shortened(60.0).segments) == len(theirs.shortened(60.0 * pace).segments)
+        assert len(mine.shortened(0.5).segments) == len(theirs.shortened(0.5).segments) < len(mine.segments)
         for a, b in zip(mine.lengths, theirs.lengths, strict=True):
             assert (b.seconds, b.information, b.misfit) == pytest.approx((pace * a.seconds, a.information, a.misfit))
     steps = [(s.numerics.timestep, s.coarse.timestep, s.cheap.timestep) for s in (own, other)]

@@ -166,8 +166,8 @@ class FloatingEpisode(Episode):
         return replace(plain, marginal=self.marginal, stretch=self.base.size.time(BLOCK))
 
     def shortened(self, seconds: float) -> FloatingEpisode:
-        """The same samples with few segments, spread evenly over them."""
-        return self._with(spread_evenly(self.segments, self.log, min(seconds, self.base.size.time(MOST_WALKED))))
+        """The same samples with few segments, so many seconds of a Nao's, spread evenly over them."""
+        return self._with(spread_evenly(self.segments, self.log, self.base.size.time(min(seconds, MOST_WALKED))))
 
     def _with(self, which: IntArray) -> FloatingEpisode:
         marginal = None if self.marginal is None else self.marginal.chosen(which)
