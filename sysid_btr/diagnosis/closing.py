@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
-from sysid_btr.identify.outcome import study_result
+from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.model import Model
@@ -70,7 +70,7 @@ class StepRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class Closing:
+class Closing(StudyOutcome):
     """Result of closing the loop.
 
     Attributes
@@ -111,15 +111,10 @@ class Closing:
         """(p,) values of all parameters of the final model."""
         return self.model.values
 
-    def to_dict(self, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
-        """The content of result.json.
-
-        Parameters
-        ----------
-        seed : of the generator the estimator was given.
-        wall_s : wall time to record, s; default that of the closing.
-        """
-        found = {
+    @property
+    def found(self) -> dict[str, Any]:
+        """What results of kind ``close`` have beside study and cost."""
+        return {
             "kind": "close",
             "verdict": self.verdict,
             "message": self.message,
@@ -133,10 +128,3 @@ class Closing:
             "steps": [asdict(s) for s in self.steps],
             "signature": self.signature,
         }
-        wall_s = self.seconds if wall_s is None else wall_s
-        return study_result(self.study, found, seed=seed, replays=self.replays, wall_s=wall_s)
-
-    def _repr_html_(self) -> str:
-        from sysid_btr.display.html import result_html
-
-        return result_html(self.to_dict())

@@ -19,7 +19,7 @@ from sysid_btr.identify.coarse import realise_servo, weigh_columns
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
-from sysid_btr.identify.outcome import study_result
+from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Scores, score
 from sysid_btr.identify.step_check import Optimum, with_short_steps
 from sysid_btr.identify.study import Study
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(StudyOutcome):
     """Declared parameters fitted to a study.
 
     Attributes
@@ -108,22 +108,6 @@ class Fit:
             "signature": None,
             **({"profiles": [p.to_dict() for p in self.profiles]} if self.profiles else {}),
         }
-
-    def to_dict(self, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
-        """The content of result.json.
-
-        Parameters
-        ----------
-        seed : of the generator the estimator was given.
-        wall_s : wall time to record, s; default that of the fit.
-        """
-        wall_s = self.seconds if wall_s is None else wall_s
-        return study_result(self.study, self.found, seed=seed, replays=self.replays, wall_s=wall_s)
-
-    def _repr_html_(self) -> str:
-        from sysid_btr.display.html import result_html
-
-        return result_html(self.to_dict())
 
 
 def fit(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sysid_btr.identify.scores import ChannelScore, channel_entries
 from sysid_btr.identify.study import Study
@@ -36,6 +36,37 @@ def study_result(
         {"schema": SCHEMA, **found, **_provenance(study), "seed": seed, "replays": replays, "wall_s": wall_s}
     )
     return plain
+
+
+class StudyOutcome:
+    """What was found in a study, as result.json and as a notebook shows it."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def study(self) -> Study: ...
+        @property
+        def found(self) -> Mapping[str, Any]: ...
+        @property
+        def replays(self) -> int: ...
+        @property
+        def seconds(self) -> float: ...
+
+    def to_dict(self, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
+        """The content of result.json.
+
+        Parameters
+        ----------
+        seed : of the generator that was given.
+        wall_s : wall time to record, s; default that of all of it.
+        """
+        wall_s = self.seconds if wall_s is None else wall_s
+        return study_result(self.study, self.found, seed=seed, replays=self.replays, wall_s=wall_s)
+
+    def _repr_html_(self) -> str:
+        from sysid_btr.display.html import result_html
+
+        return result_html(self.to_dict())
 
 
 def replay_result(

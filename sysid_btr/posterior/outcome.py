@@ -11,7 +11,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import Estimate
-from sysid_btr.identify.outcome import study_result
+from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
 from sysid_btr.posterior.likelihood import Likelihood
@@ -24,7 +24,7 @@ NOTICEABLE_GAIN = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(StudyOutcome):
     """Draws of the posterior of a fit's parameters.
 
     Attributes
@@ -137,22 +137,6 @@ class Posterior:
                 zip(entries, self.fit.estimates, self.priors, self.learnt, strict=True)
             )
         ]
-
-    def to_dict(self, *, seed: int = 0, wall_s: float | None = None) -> dict[str, Any]:
-        """The content of result.json.
-
-        Parameters
-        ----------
-        seed : of the generator that drew.
-        wall_s : wall time to record, s; default that of fit and posterior.
-        """
-        wall_s = self.seconds if wall_s is None else wall_s
-        return study_result(self.study, self.found, seed=seed, replays=self.replays, wall_s=wall_s)
-
-    def _repr_html_(self) -> str:
-        from sysid_btr.display.html import result_html
-
-        return result_html(self.to_dict())
 
 
 def _sampling(drawn: Sample) -> dict[str, Any]:
