@@ -158,9 +158,7 @@ def test_constant_force_acts_in_the_direction_of_the_joint() -> None:
         bias[0] = 0.37
         servo.biasprm = bias
 
-    np.testing.assert_allclose(
-        position(robot, LOG, terms, [0.37]), position(with_spec(robot, push), LOG), atol=EXACT
-    )
+    np.testing.assert_allclose(position(robot, LOG, terms, [0.37]), position(with_spec(robot, push), LOG), atol=EXACT)
 
 
 def test_start_corrections_change_the_start_only_where_they_are() -> None:

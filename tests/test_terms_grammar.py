@@ -13,8 +13,9 @@ from toys import SCALE, leg, pendulum
 from sysid_btr.errors import UsageError
 from sysid_btr.models.emps import emps
 from sysid_btr.models.nao import PAPER_BOUNDS, STARRED, nao
+from sysid_btr.terms.base import Term
 from sysid_btr.terms.grammar import parse_parameters
-from sysid_btr.terms.library import declarable
+from sysid_btr.terms.library import all_terms, declarable
 from sysid_btr.terms.scales import JointScale
 
 LEG = leg()
@@ -136,9 +137,7 @@ def test_units_of_a_slide_are_those_of_forces_and_lengths() -> None:
     for scales in (None, {"slider": slide}):
         units = {
             p.name: p.unit
-            for m in parse_parameters(
-                ["damping:*", "frictionloss:*", "constant_force:*", "qpos0:*"], emps(), scales
-            )
+            for m in parse_parameters(["damping:*", "frictionloss:*", "constant_force:*", "qpos0:*"], emps(), scales)
             for p in m.parameters
         }
         assert units == {
@@ -147,6 +146,16 @@ def test_units_of_a_slide_are_those_of_forces_and_lengths() -> None:
             "constant_force:slider": "N",
             "qpos0:slider": "m",
         }
+
+
+@pytest.mark.parametrize("cls", [t for t in all_terms() if t.scope in ("joint", "servo")], ids=lambda t: t.__name__)
+def test_no_unit_of_a_slide_is_that_of_a_hinge(cls: type[Term]) -> None:
+    name = f"{cls.name}.{cls.variant}" if cls.variant else cls.name
+    scales = {"slider": replace(SCALE, slide=True)}
+    (declared,) = parse_parameters([f"{name}:slider"], emps(), scales)
+    for p in (*declared.parameters, *cls.at(("slider",), scales).parameters):
+        assert "Nm" not in p.unit
+        assert "rad" not in p.unit
 
 
 def test_joints_on_one_motor_have_one_gain() -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.scales import JointScale, Scales, largest_scale
+from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, largest_scale
 
 if TYPE_CHECKING:
     import mujoco
@@ -313,8 +313,12 @@ class Term:
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        """The kinds with nominal value, bounds and scale for one place."""
+        """The kinds with nominal value, bounds and scale for one place; in the units of a hinge also at a slide."""
         return cls.kinds
+
+    def in_units_of(self, kind: Kind, *, slide: bool) -> Kind:
+        """A kind in the units of a slide or of a hinge; of a body they are the same."""
+        return replace(kind, unit=SLIDE_UNITS.get(kind.unit, kind.unit)) if slide and self.scope != "body" else kind
 
     @classmethod
     def own_value(cls, model: mujoco.MjModel, place: str) -> float:
@@ -331,9 +335,10 @@ class Term:
     def at(cls, places: Sequence[str], scales: Scales, *, shared: bool = False) -> Self:
         """The term at some places of a robot whose sizes are known."""
         bare = cls(places=tuple(places), shared=shared and len(places) > 1)
-        kinds = (kind for group in bare.grouped for kind in cls.sized(largest_scale(scales, group)))
-        names = (p.name for p in bare.parameters)
-        return replace(bare, known=tuple(parameter_of(k, name) for k, name in zip(kinds, names, strict=True)))
+        sizes = (largest_scale(scales, group) for group in bare.grouped)
+        kinds = (bare.in_units_of(kind, slide=size.slide) for size in sizes for kind in cls.sized(size))
+        known = tuple(parameter_of(kind, p.name) for kind, p in zip(kinds, bare.parameters, strict=True))
+        return replace(bare, known=known)
 
     # --- hooks, in the order in which a replay calls them -------------------------------------------------
 

@@ -32,7 +32,7 @@ class ConstantForce(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         peak = scale.counter_peak
-        return (Kind("torque", scale.unit("Nm"), 0.0, -peak, peak, 0.1 * scale.torque_rms),)
+        return (Kind("torque", "Nm", 0.0, -peak, peak, 0.1 * scale.torque_rms),)
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
         torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
@@ -63,7 +63,7 @@ class ExternalDisturbance(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         peak = max(scale.torque_peak, 1e-9)
         return (
-            Kind("torque", scale.unit("Nm"), 0.0, -20 * peak, 20 * peak, 0.1 * scale.torque_rms),
+            Kind("torque", "Nm", 0.0, -20 * peak, 20 * peak, 0.1 * scale.torque_rms),
             *cls.kinds[1:],
         )
 

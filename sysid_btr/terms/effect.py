@@ -76,9 +76,7 @@ class Effect(Term):
                 values.append(probe[0][i])
             else:
                 changes = (direction[i] - kind.nominal for direction in probe)
-                values.append(
-                    kind.nominal + sum(a * c for a, c in zip(amounts, changes, strict=True))
-                )
+                values.append(kind.nominal + sum(a * c for a, c in zip(amounts, changes, strict=True)))
             values[-1] = float(np.clip(values[-1], kind.lower, kind.upper))
         return np.array(values)
 

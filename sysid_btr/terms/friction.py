@@ -37,8 +37,7 @@ class CoulombFriction(DofEffect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        unit, size = scale.unit("Nm"), 0.15 * scale.torque_rms
-        return (Kind("torque", unit, 0.0, 0.0, scale.counter_peak, size),)
+        return (Kind("torque", "Nm", 0.0, 0.0, scale.counter_peak, 0.15 * scale.torque_rms),)
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
@@ -78,7 +77,7 @@ class ViscousDamping(Damping):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        return (Kind("b", scale.unit("Nm s/rad"), 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
+        return (Kind("b", "Nm s/rad", 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ class QuadraticDamping(Damping):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = scale.damping / scale.velocity_rms
-        return (Kind("b", scale.unit("Nm s2/rad2"), 0.0, 0.0, 5 * size, 0.1 * size),)
+        return (Kind("b", "Nm s2/rad2", 0.0, 0.0, 5 * size, 0.1 * size),)
 
 
 SIZES, SHARES, SPEEDS = (0.6, 1.0, 1.6), (0.2, 0.5, 0.8), (0.4, 1.0, 2.5)
@@ -139,9 +138,9 @@ class StribeckFriction(Effect):
         peak, size = scale.counter_peak, 0.15 * scale.torque_rms
         speed = 0.2 * scale.velocity_rms
         return (
-            Kind("coulomb", scale.unit("Nm"), 0.0, 0.0, peak, size),
-            Kind("static", scale.unit("Nm"), 0.0, 0.0, peak, size),
-            Kind("velocity", scale.unit("rad/s"), speed, 0.02 * speed, 20 * speed, 0.5 * speed),
+            Kind("coulomb", "Nm", 0.0, 0.0, peak, size),
+            Kind("static", "Nm", 0.0, 0.0, peak, size),
+            Kind("velocity", "rad/s", speed, 0.02 * speed, 20 * speed, 0.5 * speed),
         )
 
     @classmethod
@@ -225,7 +224,7 @@ class LoadFrictionQuadratic(LoadFriction):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = 1 / scale.counter_peak
-        return (Kind("curvature", f"1/{scale.unit('Nm')}", 0.0, 0.0, 2 * size, 0.1 * size),)
+        return (Kind("curvature", "1/Nm", 0.0, 0.0, 2 * size, 0.1 * size),)
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         step.friction[:, index] += values[:, :, 0] * np.square(step.drive[:, index])
@@ -254,7 +253,7 @@ class LoadFrictionStribeck(LoadFriction):
         return (
             cls.kinds[0],
             cls.kinds[1],
-            Kind("velocity", scale.unit("rad/s"), speed, 0.02 * speed, 20 * speed, 0.5 * speed),
+            Kind("velocity", "rad/s", speed, 0.02 * speed, 20 * speed, 0.5 * speed),
         )
 
     @classmethod

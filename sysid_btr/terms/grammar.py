@@ -12,7 +12,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.mujoco_conventions import SLIDE
 from sysid_btr.terms.base import Scope, Term, parameter_of
 from sysid_btr.terms.library import declarable
-from sysid_btr.terms.scales import SLIDE_UNITS, Scales, largest_scale
+from sysid_btr.terms.scales import Scales, largest_scale
 
 if TYPE_CHECKING:
     import mujoco
@@ -74,9 +74,7 @@ def parse_parameters(expressions: Sequence[str], robot: Robot, scales: Scales | 
     return tuple(result)
 
 
-def _parse_one(
-    expression: str, robot: Robot, scales: Scales | None, table: Mapping[str, type[Term]]
-) -> list[Term]:
+def _parse_one(expression: str, robot: Robot, scales: Scales | None, table: Mapping[str, type[Term]]) -> list[Term]:
     label, colon, rest = expression.partition(":")
     if not colon or not rest:
         raise UsageError("expected FIELD:GLOB[,GLOB...][=shared], for example mass:*KneePitch or kp:*=shared")
@@ -163,9 +161,9 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
     known = []
     for parameter, kind in zip(term.parameters, free, strict=True):
         bounds = _own_bounds(parameter.name, term.called, places[0], robot.bounds, (kind.lower, kind.upper))
-        unit = SLIDE_UNITS.get(kind.unit, kind.unit) if _slides(model, places[0]) else kind.unit
         named = f"{parameter.name.partition(':')[0]}:{label}"
-        known.append(parameter_of(replace(kind, unit=unit, lower=bounds[0], upper=bounds[1]), named))
+        kind = term.in_units_of(kind, slide=_slides(model, places[0]))
+        known.append(parameter_of(replace(kind, lower=bounds[0], upper=bounds[1]), named))
     return replace(term, known=tuple(known))
 
 

@@ -63,9 +63,7 @@ class Inertia(Effect):
     title: ClassVar[str] = "change of the inertia"
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
-    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("armature", "motion of the body about several axes"),
-    )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("armature", "motion of the body about several axes"),)
     scope: ClassVar[Scope] = "body"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.1, 10.0, 0.2),)
 
@@ -95,7 +93,7 @@ class Armature(DofEffect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        return (Kind("inertia", scale.unit("kg m2"), 0.0, 0.0, 5 * scale.inertia, 0.05 * scale.inertia),)
+        return (Kind("inertia", "kg m2", 0.0, 0.0, 5 * scale.inertia, 0.05 * scale.inertia),)
 
 
 ARM = 0.05

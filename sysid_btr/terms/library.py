@@ -144,8 +144,7 @@ def select_effects(names: Sequence[str]) -> tuple[type[Effect], ...]:
     if unknown:
         hints = [difflib.get_close_matches(n, called, n=1) for n in unknown]
         listed = ", ".join(
-            f"{n!r}" + (f" (did you mean {h[0]!r}?)" if h else "")
-            for n, h in zip(unknown, hints, strict=True)
+            f"{n!r}" + (f" (did you mean {h[0]!r}?)" if h else "") for n, h in zip(unknown, hints, strict=True)
         )
         raise UsageError(f"unknown effect {listed}; effects are {', '.join(effect_names())}, or all")
     wanted = {called[n] for n in names}

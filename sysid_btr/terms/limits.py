@@ -38,7 +38,7 @@ class TorqueLimit(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         peak = max(scale.torque_peak, 1e-9)
-        return (Kind("limit", scale.unit("Nm"), 2 * peak, 0.03 * peak, 2 * peak, 0.05 * peak),)
+        return (Kind("limit", "Nm", 2 * peak, 0.03 * peak, 2 * peak, 0.05 * peak),)
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
@@ -83,16 +83,14 @@ class SpeedTorqueLimit(Effect):
     )
     includes: ClassVar[tuple[str, ...]] = ("torque_limit",)
     held: ClassVar[tuple[str, ...]] = ("stall", "no_load_speed")
-    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("torque_limit", "the limit reached at several speeds"),
-    )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("torque_limit", "the limit reached at several speeds"),)
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         peak, speed = max(scale.torque_peak, 1e-9), max(scale.velocity_peak, 1e-9)
         return (
-            Kind("stall", scale.unit("Nm"), 2 * peak, 0.03 * peak, 2 * peak, 0.05 * peak),
-            Kind("no_load_speed", scale.unit("rad/s"), 2 * speed, 0.2 * speed, 20 * speed, 0.2 * speed),
+            Kind("stall", "Nm", 2 * peak, 0.03 * peak, 2 * peak, 0.05 * peak),
+            Kind("no_load_speed", "rad/s", 2 * speed, 0.2 * speed, 20 * speed, 0.2 * speed),
         )
 
     @classmethod
@@ -131,7 +129,7 @@ class SlewLimit(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         speed = max(scale.velocity_peak, 1e-9)
-        return (Kind("rate", scale.unit("rad/s"), 3 * speed, 0.05 * speed, 3 * speed, 0.05 * speed),)
+        return (Kind("rate", "rad/s", 3 * speed, 0.05 * speed, 3 * speed, 0.05 * speed),)
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:

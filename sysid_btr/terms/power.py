@@ -52,7 +52,7 @@ class VoltageSagLoad(VoltageSag):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = 0.02 / max(scale.torque_rms, 1e-9)
-        return (Kind("ratio", "1/Nm" if not scale.slide else "1/N", 0.0, 0.0, 20 * size, size),)
+        return (Kind("ratio", "1/Nm", 0.0, 0.0, 20 * size, size),)
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
@@ -87,7 +87,7 @@ class ThermalDerating(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = 0.1 / max(scale.torque_rms, 1e-9) ** 2
         return (
-            Kind("alpha", "1/Nm2" if not scale.slide else "1/N2", 0.0, 0.0, 50 * size, size),
+            Kind("alpha", "1/Nm2", 0.0, 0.0, 50 * size, size),
             Kind("tau", "s", 10.0, 1.0, 200.0, 5.0),
         )
 

@@ -57,6 +57,10 @@ Scales = Mapping[str, JointScale]
 
 SLIDE_UNITS = {
     "Nm": "N",
+    "1/Nm": "1/N",
+    "1/Nm2": "1/N2",
+    "1/rad": "1/m",
+    "Nm/(rad s)": "N/(m s)",
     "Nm s/rad": "N s/m",
     "Nm s2/rad2": "N s2/m2",
     "kg m2": "kg",

@@ -34,7 +34,7 @@ class EncoderOffset(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         reach = 0.3 if not scale.slide else 0.3 * scale.span
-        return (Kind("offset", scale.unit("rad"), 0.0, -reach, reach, reach / 60),)
+        return (Kind("offset", "rad", 0.0, -reach, reach, reach / 60),)
 
     def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
         outputs.position[:, :, batch.index.of(self.places)] += values[:, None, :, 0]

@@ -116,7 +116,7 @@ class IntegralGain(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = scale.torque_rms / (0.02 * max(scale.span, 1e-9))
-        return (Kind("ki", scale.unit("Nm/(rad s)"), 0.0, 0.0, 10 * size, 0.1 * size),)
+        return (Kind("ki", "Nm/(rad s)", 0.0, 0.0, 10 * size, 0.1 * size),)
 
     def start_law(self, batch: BatchModel, values: FloatArray) -> FloatArray:
         return np.zeros(values.shape[:2])
@@ -153,7 +153,7 @@ class BackEmf(Effect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        return (Kind("b", scale.unit("Nm s/rad"), 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
+        return (Kind("b", "Nm s/rad", 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         for place, column in enumerate(index):

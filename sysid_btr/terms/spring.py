@@ -42,8 +42,8 @@ class JointSpring(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         k, reach = scale.torque_rms / scale.span, 3 * max(scale.span, 1.0)
         return (
-            Kind("stiffness", scale.unit("Nm/rad"), 0.0, 0.0, 30 * k, 0.3 * k),
-            Kind("rest", scale.unit("rad"), 0.0, -reach, reach, 0.2 * scale.span),
+            Kind("stiffness", "Nm/rad", 0.0, 0.0, 30 * k, 0.3 * k),
+            Kind("rest", "rad", 0.0, -reach, reach, 0.2 * scale.span),
         )
 
     @classmethod

@@ -58,7 +58,7 @@ class Backlash(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         soft = GIVES * max(scale.span, 1e-9) / max(scale.torque_rms, 1e-9)
-        return (cls.kinds[0], Kind("softness", scale.unit("rad/Nm"), 0.0, 0.0, 20 * soft, soft))
+        return (cls.kinds[0], Kind("softness", "rad/Nm", 0.0, 0.0, 20 * soft, soft))
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
@@ -149,7 +149,7 @@ class JointCompliance(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = 0.004 * max(scale.span, 1e-9) / max(scale.torque_rms, 1e-9)
-        return (Kind("softness", scale.unit("rad/Nm"), 0.0, 0.0, 100 * size, size),)
+        return (Kind("softness", "rad/Nm", 0.0, 0.0, 100 * size, size),)
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
@@ -214,9 +214,9 @@ class Cogging(Effect):
         peak, size = 2 * scale.counter_peak, 0.1 * scale.torque_rms
         turn = 2 * np.pi / max(scale.span, 1e-9)
         return (
-            Kind("sine", scale.unit("Nm"), 0.0, -peak, peak, size),
-            Kind("cosine", scale.unit("Nm"), 0.0, -peak, peak, size),
-            Kind("number", "1/rad" if not scale.slide else "1/m", 4 * turn, turn, 200 * turn, 0.05 * turn),
+            Kind("sine", "Nm", 0.0, -peak, peak, size),
+            Kind("cosine", "Nm", 0.0, -peak, peak, size),
+            Kind("number", "1/rad", 4 * turn, turn, 200 * turn, 0.05 * turn),
         )
 
     @classmethod
