@@ -77,7 +77,7 @@ def proposals(
     library : effects that may be asked for.
     """
     wanted = {Cogging, ExternalDisturbance, ExternalDisturbanceTrain, DriveDisturbanceTrain} & set(library)
-    if not wanted or not _loud(problem, residual):
+    if not wanted or not np.any(problem.column_chi2(residual) >= LOUD):
         return []
     asked: list[Perturbation] = []
     torques = missing_torques(problem, values, study.scales)
@@ -115,13 +115,6 @@ def _within_train(problem: ReplayProblem, values: FloatArray, joint: str, start:
             if (start + duration - first) % period < duration + long:
                 return True
     return False
-
-
-def _loud(problem: ReplayProblem, residual: FloatArray) -> bool:
-    sums = np.bincount(problem.column_labels, residual**2, len(problem.columns))
-    count = np.maximum(np.bincount(problem.column_labels, minlength=len(problem.columns)), 1)
-    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
-    return bool(np.any(factor * sums / count >= LOUD))
 
 
 def _direction(one: MissingTorque) -> FloatArray:

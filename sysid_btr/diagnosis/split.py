@@ -36,8 +36,8 @@ def later_split(study: Study, fitted: Fitted, rules: Selection) -> Study | None:
         return None
     problem = study.holdout_problem(fitted.model)
     residual = problem.residuals(fitted.model.values[None])[0]
-    scale = np.array([t.sigma[k] / t.noise[k] for _, t, k in problem.columns])[problem.column_labels]
-    excess = np.where(hidden[problem.column_labels], (residual * scale) ** 2 - 1, 0.0)
+    labels = problem.column_labels
+    excess = np.where(hidden[labels], residual**2 * problem.inflation[labels] - 1, 0.0)
     by_block = np.bincount(problem.blocks, np.nan_to_num(excess))
     train, holdout, first = list(study.train), list(study.holdout), 0
     for i, episode in enumerate(study.holdout):

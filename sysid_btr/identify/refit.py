@@ -147,8 +147,8 @@ def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:
     train = study.train_problem(model)
     holdout = study.holdout_problem(model)
     r, s = of_both(train, holdout, lambda problem: np.asarray(problem.residuals(model.values[None])[0]))
-    train_columns, holdout_columns = _by_column(train, r), _by_column(holdout, s)
-    a, b = _counts(train), _counts(holdout)
+    train_columns, holdout_columns = train.column_chi2(r), holdout.column_chi2(s)
+    a, b = train.counts, holdout.counts
     same = len(a) == len(b)
     return Fitted(
         model=model,
@@ -210,18 +210,6 @@ def inflated(study: Study, fitted: Fitted) -> tuple[Study, Fitted]:
     return study, judge(study, fitted.model, fitted.evaluations)
 
 
-def _counts(problem: ReplayProblem) -> FloatArray:
-    return np.asarray(np.bincount(problem.column_labels, minlength=len(problem.columns)), dtype=np.float64)
-
-
-def _by_column(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
-    """Mean square of error over noise floor of each column, however it was whitened."""
-    sums = np.bincount(problem.column_labels, residual**2, len(problem.columns))
-    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
-    mean: FloatArray = factor * sums / np.maximum(_counts(problem), 1)
-    return mean
-
-
 def _memory(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     """Integrated autocorrelation of each column's residual, by batch means over half-second stretches."""
     columns, blocks = problem.column_labels, problem.blocks
@@ -233,17 +221,16 @@ def _memory(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     square = np.bincount(columns, np.nan_to_num(residual) ** 2, len(problem.columns))
     means = np.bincount(np.arange(size) // width, total**2 / np.maximum(count, 1), len(problem.columns))
     live = np.bincount(np.arange(size) // width, count > 0, len(problem.columns))
-    variance = square / np.maximum(_counts(problem), 1)
+    variance = square / np.maximum(problem.counts, 1)
     ratio: FloatArray = means / np.maximum(live, 1) / np.maximum(variance, 1e-300)
     return np.maximum(ratio, 1.0)
 
 
 def _by_cell(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     """Sums of squares over noise floor, (columns, stretches)."""
-    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
     columns, blocks = problem.column_labels, problem.blocks
     width = int(blocks.max()) + 1
-    square = np.nan_to_num(residual, nan=1e6) ** 2 * factor[columns]
+    square = np.nan_to_num(residual, nan=1e6) ** 2 * problem.inflation[columns]
     sums = np.bincount(columns * width + blocks, square, len(problem.columns) * width)
     return np.asarray(sums.reshape(-1, width), dtype=np.float64)
 

@@ -92,8 +92,7 @@ def _short_enough(at: Optimum, shift: FloatArray) -> bool:
 
 def _mean_chi2(problem: ReplayProblem, residual: FloatArray) -> float:
     """Mean square of error over noise floor, however the residual was whitened."""
-    factor = np.array([(t.sigma[k] / t.noise[k]) ** 2 for _, t, k in problem.columns])
-    return float(np.mean(residual**2 * factor[problem.column_labels]))
+    return float(np.mean(residual**2 * problem.inflation[problem.column_labels]))
 
 
 def numerics_shift(

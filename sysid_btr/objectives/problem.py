@@ -250,6 +250,21 @@ class ReplayProblem:
         )
 
     @cached_property
+    def inflation(self) -> FloatArray:
+        """(columns,) variance by which each column is whitened over that of its noise floor."""
+        return np.array([(target.sigma[k] / target.noise[k]) ** 2 for _, target, k in self.columns])
+
+    @cached_property
+    def counts(self) -> FloatArray:
+        """(columns,) number of residuals."""
+        return np.asarray(np.bincount(self.column_labels, minlength=len(self.columns)), dtype=np.float64)
+
+    def column_chi2(self, residual: FloatArray) -> FloatArray:
+        """(columns,) mean square of error over noise floor, however the residual (r,) was whitened."""
+        sums = np.bincount(self.column_labels, residual**2, len(self.columns))
+        return np.asarray(self.inflation * sums / np.maximum(self.counts, 1))
+
+    @cached_property
     def where(self) -> dict[str, int]:
         """Subtree of every joint and body by name; one where a free base joins them in any of the logs."""
         free = (e.replay for e in self.episodes if e.replay.log.meta.mount == "free")
