@@ -21,19 +21,19 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.segments import BASE, Windows
+from sysid_btr.simulation.segments import BASE, Segments
 
 MASSES = ["mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"]
 
 
-def random_states(n: int, joints: int, rng: np.random.Generator) -> Windows:
+def random_states(n: int, joints: int, rng: np.random.Generator) -> Segments:
     quaternion = rng.normal(size=(n, 4))
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     rows = np.stack([np.arange(n), np.arange(n) + 2], axis=1)
     three = (rng.normal(size=(n, 3)) for _ in range(3))
     position, velocity, rate = three
     q, dq = rng.normal(size=(2, n, joints))
-    return Windows(rows, position, quaternion, velocity, rate, q, dq, np.ones((n, BASE + 2 * joints)))
+    return Segments(rows, position, quaternion, velocity, rate, q, dq, np.ones((n, BASE + 2 * joints)))
 
 
 def problem_of(study: Study, values: dict[str, float] | None = None) -> tuple[ReplayProblem, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Replay by windows, uncertain starts, and identification on walks."""
+"""Replay by segments, uncertain starts, and identification on walks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from sysid_btr.objectives.marginal import Marginal, projections
 from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.simulation.segments import BASE, WindowReplay, Windows, on_slope
+from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments, on_slope
 from sysid_btr.terms.contact import FootCompliance, FootFriction
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
@@ -48,17 +48,17 @@ FINE = Numerics("RK4", 0.001)
 LENGTH = 10
 
 
-def true_windows(
+def true_segments(
     log: Log, truth: Truth, replay_joints: tuple[str, ...], first: int = 60, length: int = LENGTH
-) -> Windows:
-    """Windows that start from the true states."""
+) -> Segments:
+    """Segments that start from the true states."""
     rows = np.array([(a, a + length) for a in range(first, len(log) - length, length)])
     order = [truth.joints.index(j) for j in replay_joints]
     quaternion = np.empty((len(rows), 4))
     for k, a in enumerate(rows[:, 0]):
         mujoco.mju_mat2Quat(quaternion[k], truth.rotation[a].ravel())
     a = rows[:, 0]
-    return Windows(
+    return Segments(
         rows,
         truth.position[a],
         quaternion,
@@ -70,13 +70,13 @@ def true_windows(
     )
 
 
-def window_replay(log: Log, truth: Truth, *terms: object, **kwargs: object) -> WindowReplay:
+def window_replay(log: Log, truth: Truth, *terms: object, **kwargs: object) -> SegmentReplay:
     robot = load_robot("nao")
-    bare = WindowReplay(robot, log, tuple(terms), FINE, threads=1)  # type: ignore[arg-type]
-    return replace(bare, windows=true_windows(log, truth, bare.index.joints, **kwargs))  # type: ignore[arg-type]
+    bare = SegmentReplay(robot, log, tuple(terms), FINE, threads=1)  # type: ignore[arg-type]
+    return replace(bare, segments=true_segments(log, truth, bare.index.joints, **kwargs))  # type: ignore[arg-type]
 
 
-def joint_truth(truth: Truth, replay: WindowReplay) -> np.ndarray:
+def joint_truth(truth: Truth, replay: SegmentReplay) -> np.ndarray:
     return truth.joint_position[:, [truth.joints.index(j) for j in replay.index.joints]]
 
 
@@ -85,7 +85,7 @@ def quiet_walk() -> tuple[Log, Truth]:
     return record_walk(Gait(), 4.0, noise=0.0)
 
 
-# --- windows --------------------------------------------------------------------------------------------
+# --- segments --------------------------------------------------------------------------------------------
 
 
 def test_windows_from_true_states_reproduce_the_whole_walk() -> None:
@@ -94,7 +94,7 @@ def test_windows_from_true_states_reproduce_the_whole_walk() -> None:
     outputs = replay.predict(np.zeros((1, 0)))
     assert outputs.position.shape == (1, len(log), 22)
     inside = np.zeros(len(log), dtype=bool)
-    for a, b in replay.windows.rows:  # type: ignore[union-attr]
+    for a, b in replay.segments.rows:  # type: ignore[union-attr]
         inside[a:b] = True
     assert np.isnan(outputs.position[0, ~inside]).all()
     error = outputs.position[0, inside] - joint_truth(truth, replay)[inside]
@@ -106,9 +106,9 @@ def test_a_window_does_not_depend_on_the_others_nor_on_the_candidates_beside_it(
     terms = parse_parameters(["mass:RKneePitch"], load_robot("nao"))
     replay = window_replay(log, truth, *terms)
     whole = replay.predict(np.array([[0.8], [1.0], [1.3]])).position
-    assert replay.windows is not None
-    alone = replace(replay, windows=replay.windows.chosen(np.array([3])))
-    a, b = replay.windows.rows[3]
+    assert replay.segments is not None
+    alone = replace(replay, segments=replay.segments.chosen(np.array([3])))
+    a, b = replay.segments.rows[3]
     assert np.array_equal(alone.predict(np.array([[1.3]])).position[0, a:b], whole[2, a:b])
 
 
@@ -130,22 +130,22 @@ def test_a_torque_known_in_advance_acts_in_every_window() -> None:
     replay = window_replay(log, truth, push)
     plain, pushed = replay.predict(np.array([[0.0], [0.2]])).position
     column = replay.index.joints.index("HeadYaw")
-    assert replay.windows is not None
-    for _, b in replay.windows.rows:
+    assert replay.segments is not None
+    for _, b in replay.segments.rows:
         assert pushed[b - 1, column] - plain[b - 1, column] > 1e-3
 
 
 def test_a_change_of_the_start_moves_its_window_as_a_simulation_from_there_does() -> None:
     log, truth = quiet_walk()
     replay = window_replay(log, truth)
-    assert replay.windows is not None
+    assert replay.segments is not None
     joints = len(replay.index.joints)
     change = np.zeros((2, BASE + 2 * joints))
     change[0, 4], change[1, BASE + 3] = 0.01, 0.01
     for w, outputs in replay.respond(np.zeros(0), change):
         for k in range(2):
-            moved = replace(replay, windows=replay.windows.chosen(np.array([w])).moved(change[k : k + 1]))
-            a, b = replay.windows.rows[w]
+            moved = replace(replay, segments=replay.segments.chosen(np.array([w])).moved(change[k : k + 1]))
+            a, b = replay.segments.rows[w]
             assert np.array_equal(moved.predict(np.zeros((1, 0))).position[0, a:b], outputs.position[k])
 
 
@@ -185,13 +185,13 @@ def test_on_a_slope_gravity_and_the_base_tilt_together() -> None:
     log, truth = record_walk(Gait(), 4.0, noise=0.0, edit=slope)
     effect = GravityTilt(("robot",))
     replay = window_replay(log, truth, effect)
-    assert replay.windows is not None
+    assert replay.segments is not None
     # what an inertial unit knows: the attitude to gravity, as if the floor were level
     unit = np.array([[0.0, 0.0, -9.81]])
     x, y = tilt
     own = 9.81 * np.array([-np.sin(y) * np.cos(x), np.sin(x), -np.cos(y) * np.cos(x)])
-    back = on_slope(replay.windows, own, np.repeat(unit, len(replay.windows), axis=0))
-    outputs = replace(replay, windows=back).predict(np.array([[0.0, 0.0], tilt]))
+    back = on_slope(replay.segments, own, np.repeat(unit, len(replay.segments), axis=0))
+    outputs = replace(replay, segments=back).predict(np.array([[0.0, 0.0], tilt]))
     inside = np.isfinite(outputs.position[0, :, 0])
     flat, sloped = (np.sqrt(np.mean((p[inside] - joint_truth(truth, replay)[inside]) ** 2)) for p in outputs.position)
     assert sloped < 0.3 * flat
@@ -298,7 +298,7 @@ def test_a_fall_ends_a_walk() -> None:
 
 
 @cache
-def best_segments() -> tuple[Windows, tuple[SegmentLength, ...]]:
+def best_segments() -> tuple[Segments, tuple[SegmentLength, ...]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segments_module, "LENGTHS", (0.1, 0.2))
         patch.setattr(segments_module, "TRIED", 4)
@@ -497,8 +497,8 @@ def test_a_free_and_a_held_log_are_fitted_together() -> None:
     study = make_study(load_robot("nao"), [log, held], threads=2)
     problem = study.train_problem(study.declare(["mass:LKneePitch", "mass:RShoulderRoll"]))
     walk, gantry = (e.replay for e in problem.episodes)
-    assert isinstance(walk, WindowReplay)
-    assert not isinstance(gantry, WindowReplay)
+    assert isinstance(walk, SegmentReplay)
+    assert not isinstance(gantry, SegmentReplay)
     assert walk.model.nq == gantry.model.nq + 7
     # a free base lets every parameter reach every joint
     assert all(len(group) == 1 for group in problem.groups)

@@ -1,7 +1,7 @@
 """Trials as a study: what `close` needs to look for what the model lacks.
 
 A trial begins from standing still in a known pose. So its early part is replayed from there as in Step 3, and needs
-no reconstruction of the base, as windows of a walk do; those cost many times the simulations.
+no reconstruction of the base, as segments of a walk do; those cost many times the simulations.
 """
 
 from __future__ import annotations

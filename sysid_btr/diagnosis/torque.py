@@ -101,7 +101,7 @@ def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) 
     result: list[MissingTorque] = []
     for i, episode in enumerate(problem.episodes):
         target = next((t for t in episode.targets if t.channel == "position"), None)
-        # windows are too short for the memory of a deconvolution
+        # segments are too short for the memory of a deconvolution
         if target is not None and episode.marginal is None:
             result += _deconvolve(i, episode, target, values, scales)
     return tuple(result)

@@ -29,7 +29,7 @@ from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid, make_grid
-from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
+from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments
 from sysid_btr.simulation.silence import silenced
 
 if TYPE_CHECKING:
@@ -108,21 +108,21 @@ class SampleSteps(FloatingReplay):
         """Bodies that touch the ground."""
         return [self.model.body(foot.name).id for foot in touching_bodies(self.model)]
 
-    def push(self, window: IntArray, change: FloatArray | None) -> Fields:
+    def push(self, segment: IntArray, change: FloatArray | None) -> Fields:
         assert self.wrench is not None
-        wrench = self.wrench[window]
+        wrench = self.wrench[segment]
         if change is not None:
             wrench = wrench + change[:, -wrench[0].size :].reshape(wrench.shape)
-        pushed = np.zeros((len(window), self.model.nbody, 6))
+        pushed = np.zeros((len(segment), self.model.nbody, 6))
         pushed[:, self.feet] = wrench
         return {"xfrc_applied": pushed}
 
-    def ends(self, candidates: FloatArray, row: IntArray, window: IntArray, change: FloatArray) -> Windows:
-        """States at the ends of steps: of candidate `row`, in step `window`, from a start with a `change`."""
+    def ends(self, candidates: FloatArray, row: IntArray, segment: IntArray, change: FloatArray) -> Segments:
+        """States at the ends of steps: of candidate `row`, in step `segment`, from a start with a `change`."""
         size, j = len(row), len(self.index.joints)
         base, q, dq = np.empty((size, 13)), np.empty((size, j)), np.empty((size, j))
         with silenced():
-            for sims, part in self._simulate(candidates, row, window, change):
+            for sims, part in self._simulate(candidates, row, segment, change):
                 assert part.base is not None
                 base[sims], q[sims], dq[sims] = part.base[:, -1], part.position[:, -1], part.velocity[:, -1]
         # a simulation that failed has no attitude; the rest of it says so
@@ -130,8 +130,8 @@ class SampleSteps(FloatingReplay):
         base[failed] = np.nan
         base[failed, 3:7] = 1.0, 0.0, 0.0, 0.0
         std = np.zeros((size, BASE + 2 * j))
-        rows = np.asarray(self._windows.rows[window])
-        return Windows(rows, base[:, :3], base[:, 3:7], base[:, 7:10], base[:, 10:], q, dq, std)
+        rows = np.asarray(self._segments.rows[segment])
+        return Segments(rows, base[:, :3], base[:, 3:7], base[:, 7:10], base[:, 10:], q, dq, std)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class _Chain:
     """
 
     steps: SampleSteps
-    states: Windows
+    states: Segments
     touch: BoolArray
     linked: BoolArray
     measured: FloatArray
@@ -283,11 +283,11 @@ BEYOND = ("start_law", "applied_torque", "initial_state", "read_out")
 """Stages of a term that take more than a step from one state to the next: memory, clocks, sensors."""
 
 
-def _nominal(replay: WindowReplay) -> FloatArray:
+def _nominal(replay: SegmentReplay) -> FloatArray:
     return np.array([p.nominal for p in replay.parameters])
 
 
-def _written(replay: WindowReplay, values: FloatArray) -> BatchModel:
+def _written(replay: SegmentReplay, values: FloatArray) -> BatchModel:
     """The models of one candidate."""
     return replay.batch(replay._values(values[None]), 1)
 
@@ -299,7 +299,7 @@ def _chain(replay: FloatingReplay) -> _Chain:
     n = len(walk)
     states = starts_at(base, np.stack([np.arange(n), np.arange(n) + 2], axis=1))
     own = {f.name: getattr(replay, f.name) for f in fields(replay)} | {"effort": False}
-    steps = SampleSteps(**{**own, "windows": states.chosen(np.arange(n - 1))})
+    steps = SampleSteps(**{**own, "segments": states.chosen(np.arange(n - 1))})
     near = _touching(steps.model, walk, base)
     touch = near[:-1] | near[1:]
     share = touch / np.maximum(touch.sum(axis=1, keepdims=True), 1)
@@ -359,8 +359,8 @@ def _derive(chain: _Chain, values: FloatArray) -> _Derivatives:
     kinds = chain.size.force(1.0) * np.tile([NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3, forces // 6)
     nudges[1 + len(lanes) + np.arange(forces), d + np.arange(forces)] = kinds
     count = len(nudges)
-    window, lane = np.repeat(np.arange(w), count), np.tile(np.arange(count), w)
-    ends = steps.ends(values[None], np.zeros(w * count, dtype=np.int64), window, nudges[lane])
+    segment, lane = np.repeat(np.arange(w), count), np.tile(np.arange(count), w)
+    ends = steps.ends(values[None], np.zeros(w * count, dtype=np.int64), segment, nudges[lane])
     first = np.arange(w) * count
     change = difference(ends, ends.chosen(np.repeat(first, count))).reshape(w, count, d)
     start = np.tile(np.eye(d), (w, 1, 1))
@@ -402,8 +402,8 @@ def _blows(chain: _Chain, values: FloatArray) -> FloatArray:
     return result
 
 
-def difference(a: Windows, b: Windows) -> FloatArray:
-    """(w, d) change that takes states `b` to `a`, in the coordinates of `Windows.std`."""
+def difference(a: Segments, b: Segments) -> FloatArray:
+    """(w, d) change that takes states `b` to `a`, in the coordinates of `Segments.std`."""
     turned, from_here = (to_rotation(s.quaternion) for s in (a, b))
     return np.concatenate(
         [
@@ -427,11 +427,11 @@ def _simulate(chain: _Chain, values: FloatArray, free: IntArray, step: FloatArra
     candidates = np.tile(values, (1 + len(free), 1))
     candidates[1 + np.arange(len(free)), free] += step
     count = len(candidates)
-    row, window = np.tile(np.arange(count), w), np.repeat(every, count)
+    row, segment = np.tile(np.arange(count), w), np.repeat(every, count)
     coarse = _coarse(chain)
-    around = coarse.ends(candidates, row, window, nothing[window])
+    around = coarse.ends(candidates, row, segment, nothing[segment])
     plain = around.chosen(every * count)
-    by_number = difference(around, plain.chosen(window)).reshape(w, count, -1)[:, 1:] / step[:, None]
+    by_number = difference(around, plain.chosen(segment)).reshape(w, count, -1)[:, 1:] / step[:, None]
     late = replace(coarse, late=1).ends(values[None], np.zeros(w, dtype=np.int64), every, nothing)
     by_time = difference(late, plain) / coarse.numerics.timestep
     by_number = np.concatenate([by_number, by_time[:, None]], axis=1)
@@ -553,5 +553,5 @@ def _moved(chain: _Chain, known: _Derivatives, found: _Round, change: FloatArray
     assert wrench is not None
     mean = pushed[:, : wrench[0].size].reshape(wrench.shape)
     states = chain.states.moved(move)
-    steps = replace(chain.steps, windows=states.chosen(np.arange(n - 1)), wrench=wrench + mean)
+    steps = replace(chain.steps, segments=states.chosen(np.arange(n - 1)), wrench=wrench + mean)
     return replace(chain, steps=steps, states=states)

@@ -34,7 +34,7 @@ from sysid_btr.objectives.marginal import Marginal
 from sysid_btr.objectives.problem import BLOCK, Comparison, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
-from sysid_btr.simulation.segments import Windows
+from sysid_btr.simulation.segments import Segments
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Terms
 
@@ -107,7 +107,7 @@ class FloatingEpisode(Episode):
     """
 
     base: BaseState
-    segments: Windows
+    segments: Segments
     marginal: Marginal | None = None
     lengths: tuple[SegmentLength, ...] = ()
 
@@ -150,7 +150,7 @@ class FloatingEpisode(Episode):
     ) -> FloatingReplay:
         robot = self.robot.for_log(self.log)
         return FloatingReplay(
-            robot, self.log, tuple(terms), numerics, effort, threads, windows=self.segments, base=self.base
+            robot, self.log, tuple(terms), numerics, effort, threads, segments=self.segments, base=self.base
         )
 
     def compare(

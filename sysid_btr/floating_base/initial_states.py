@@ -12,19 +12,19 @@ from sysid_btr.objectives.marginal import Marginal, projections, sensitivity
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.simulation.segments import BASE, WindowReplay, Windows
+from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments
 from sysid_btr.simulation.silence import silenced
 
 
 def update_initial_states(
-    replay: WindowReplay,
+    replay: SegmentReplay,
     targets: tuple[Target, ...],
     before: Marginal | None,
     values: FloatArray,
     coarse: Numerics,
     *,
     anew: bool = True,
-) -> tuple[Windows, Marginal]:
+) -> tuple[Segments, Marginal]:
     """Move the initial states of segments to where the data want them, and find what they leave open.
 
     One Gauss-Newton step for each segment, with the reconstructed state as its prior.
@@ -36,8 +36,8 @@ def update_initial_states(
     coarse : integrator and step for derivatives with respect to the initial states.
     anew : whether derivatives that are known are taken again.
     """
-    assert replay.windows is not None
-    segments, marginal = replay.windows, before
+    assert replay.segments is not None
+    segments, marginal = replay.segments, before
     w, coordinates = segments.std.shape
     if anew or marginal is None:
         marginal = respond(replace(replay, numerics=coarse), values)
@@ -59,7 +59,7 @@ def update_initial_states(
         change[i] = (best - shift[i]) * segments.std[i]
         shift[i] = best
     segments, marginal = segments.moved(change), replace(marginal, shift=shift)
-    return segments, weighed(marginal, replace(replay, windows=segments), plain, values)
+    return segments, weighed(marginal, replace(replay, segments=segments), plain, values)
 
 
 USUAL, LEAST_WEIGHT = 0.3, 0.02
@@ -68,7 +68,7 @@ FARTHEST = 3.0
 """Standard deviations by which an initial state is moved at most."""
 
 
-def weighed(marginal: Marginal, replay: WindowReplay, targets: tuple[Target, ...], values: FloatArray) -> Marginal:
+def weighed(marginal: Marginal, replay: SegmentReplay, targets: tuple[Target, ...], values: FloatArray) -> Marginal:
     """Count each segment by the size of the error that is left in it: a missed impact is no evidence.
 
     Only segments that are worse than most are counted less: an error in all of them is to be found, not hidden.
@@ -81,16 +81,16 @@ def weighed(marginal: Marginal, replay: WindowReplay, targets: tuple[Target, ...
     return replace(plain, weight=np.clip(np.sqrt(usual / chi2), LEAST_WEIGHT, 1.0))
 
 
-def respond(replay: WindowReplay, values: FloatArray) -> Marginal:
+def respond(replay: SegmentReplay, values: FloatArray) -> Marginal:
     """Derivatives of all sensors with respect to the initial states of all segments."""
-    windows = replay.windows
-    assert windows is not None
+    segments = replay.segments
+    assert segments is not None
     lanes = start_lanes(replay)
-    w, coordinates = windows.std.shape
+    w, coordinates = segments.std.shape
     directions = np.zeros((w, len(lanes) + 1, coordinates))
     for k, lane in enumerate(lanes):
         for coordinate, _ in lane:
-            directions[:, k, coordinate] = windows.std[:, coordinate]
+            directions[:, k, coordinate] = segments.std[:, coordinate]
     responses: list[dict[str, FloatArray]] = [{} for _ in range(w)]
     channels = ("position", "velocity", *(("effort",) if replay.effort else ()))
     with silenced():
@@ -103,10 +103,10 @@ def respond(replay: WindowReplay, values: FloatArray) -> Marginal:
                     for coordinate, seen in lane:
                         table[coordinate][:, seen] = change[k][:, seen]
                 responses[i][channel] = table
-    return Marginal(windows.rows, tuple(responses), np.ones(w), np.zeros((w, coordinates)))
+    return Marginal(segments.rows, tuple(responses), np.ones(w), np.zeros((w, coordinates)))
 
 
-def start_lanes(replay: WindowReplay) -> list[list[tuple[int, IntArray]]]:
+def start_lanes(replay: SegmentReplay) -> list[list[tuple[int, IntArray]]]:
     """Coordinates of an initial state that one simulation can vary together: (coordinate, joints that it moves).
 
     Limbs without a foot hang on the base; what happens in one of them hardly moves the others.

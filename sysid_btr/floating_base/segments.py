@@ -19,7 +19,7 @@ from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
-from sysid_btr.simulation.segments import WindowReplay, Windows
+from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms
@@ -35,7 +35,7 @@ FEWEST = 4
 
 
 @dataclass(frozen=True)
-class FloatingReplay(WindowReplay):
+class FloatingReplay(SegmentReplay):
     """A log of a floating base replayed by segments.
 
     Attributes
@@ -48,7 +48,7 @@ class FloatingReplay(WindowReplay):
 
 def segment_log(
     log: Log, base: BaseState, seconds: float, borders: Sequence[float] = (), *, late: float = 0.0
-) -> Windows:
+) -> Segments:
     """Tile the usable parts of a log with segments.
 
     Parameters
@@ -77,13 +77,13 @@ def segment_log(
     if len(rows) < FEWEST:
         found = "; ".join(map(str, base.events)) or "no event"
         raise LogError(
-            f"log {log.path or ''}: only {len(rows)} windows of {seconds:g} s can be used of it ({found}): record "
+            f"log {log.path or ''}: only {len(rows)} segments of {seconds:g} s can be used of it ({found}): record "
             "more walking"
         )
     return starts_at(base, np.array(rows, dtype=np.int64))
 
 
-def starts_at(base: BaseState, rows: IntArray) -> Windows:
+def starts_at(base: BaseState, rows: IntArray) -> Segments:
     """Segments that start from the reconstructed state."""
     first = rows[:, 0]
     std = WIDENED * np.concatenate(
@@ -99,7 +99,7 @@ def starts_at(base: BaseState, rows: IntArray) -> Windows:
     )
     # where a robot stands and where it looks changes nothing
     std[:, [0, 1]] = 0.0
-    return Windows(
+    return Segments(
         rows,
         base.position[first],
         base.quaternion[first],
@@ -111,7 +111,7 @@ def starts_at(base: BaseState, rows: IntArray) -> Windows:
     )
 
 
-def segment_seconds(segments: Windows, log: Log) -> float:
+def segment_seconds(segments: Segments, log: Log) -> float:
     """Length of a segment, s; 0 where there is none."""
     if len(segments) == 0:
         return 0.0
@@ -119,7 +119,7 @@ def segment_seconds(segments: Windows, log: Log) -> float:
     return float((log.time[b - 1] - log.time[a]) * (b - a) / max(b - a - 1, 1))
 
 
-def spread_evenly(segments: Windows, log: Log, seconds: float) -> IntArray:
+def spread_evenly(segments: Segments, log: Log, seconds: float) -> IntArray:
     """Which segments (k,) to take for no more than so many seconds of them, spread evenly over the log."""
     if len(segments) == 0:
         return np.arange(0)
@@ -127,7 +127,7 @@ def spread_evenly(segments: Windows, log: Log, seconds: float) -> IntArray:
     return np.unique(np.linspace(0, len(segments) - 1, count).astype(np.int64))
 
 
-def covered(segments: Windows, samples: int) -> BoolArray:
+def covered(segments: Segments, samples: int) -> BoolArray:
     """(n,) whether a sample of a log lies in a segment."""
     result = np.zeros(samples, dtype=bool)
     for a, b in segments.rows:
@@ -142,7 +142,7 @@ def whole_step(period: float, longest: float) -> float:
 
 
 def segment_numerics(
-    robot: Robot, log: Log, segments: Windows, size: BodySize, threads: int = 0, simulator: str = MUJOCO
+    robot: Robot, log: Log, segments: Segments, size: BodySize, threads: int = 0, simulator: str = MUJOCO
 ) -> tuple[Numerics, float]:
     """Integrator and step for a log of a floating base, and the change in noise floors when the step is halved.
 
@@ -156,7 +156,7 @@ def segment_numerics(
     error = np.inf
     for _ in range(2):
         replays = [
-            WindowReplay(robot, log, (), n, threads=threads, windows=few) for n in (numerics, numerics.halved())
+            SegmentReplay(robot, log, (), n, threads=threads, segments=few) for n in (numerics, numerics.halved())
         ]
         runs = [replay.predict(np.zeros((1, 0))) for replay in replays]
         change = (runs[1].position - runs[0].position)[0]
@@ -213,7 +213,7 @@ def choose_length(
         except LogError:
             continue
         segments = segments.chosen(spread_evenly(segments, log, TRIED * seconds))
-        replay = WindowReplay(robot.for_log(log), log, tuple(terms), numerics, threads=threads, windows=segments)
+        replay = SegmentReplay(robot.for_log(log), log, tuple(terms), numerics, threads=threads, segments=segments)
         inside = covered(segments, len(log))[:, None]
         targets = tuple(
             replace(t, mask=t.mask & inside) for t in make_targets(log, replay.index.joints, ("position",), 0.0)
@@ -241,7 +241,7 @@ def choose_length(
 
 def segment_best(
     robot: Robot, log: Log, base: BaseState, borders: Sequence[float] = (), threads: int = 0
-) -> tuple[Windows, tuple[SegmentLength, ...]]:
+) -> tuple[Segments, tuple[SegmentLength, ...]]:
     """Segments of the length that the part of a log before the first border asks for, and the lengths tried."""
     stop = int(np.searchsorted(log.time - log.time[0], borders[0])) if borders else len(log)
     step = whole_step(float(np.median(np.diff(log.time))), base.size.time(FASTEST))

@@ -11,7 +11,7 @@ from sysid_btr.floating_base.size import BodySize, measure_size
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.covariance import covariance, spread
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.segments import WindowReplay
+from sysid_btr.simulation.segments import SegmentReplay
 
 
 def repeated_error(problem: ReplayProblem, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
@@ -52,7 +52,7 @@ SHORT = 8
 
 def of_legs(problem: ReplayProblem) -> BoolArray:
     """(p,) whether a parameter is of a body between the base and the ground of a walk, or of the ground itself."""
-    walk = next((e.replay for e in problem.episodes if isinstance(e.replay, WindowReplay)), None)
+    walk = next((e.replay for e in problem.episodes if isinstance(e.replay, SegmentReplay)), None)
     if walk is None:
         return np.zeros(len(problem.parameters), dtype=bool)
     model = walk.model
@@ -84,13 +84,13 @@ def _phases(problem: ReplayProblem) -> IntArray | None:
     labels, found, first = [], False, 0
     for comparison in problem.episodes:
         replay, log = comparison.replay, comparison.replay.log
-        length = stride(log, measure_size(replay.model)) if isinstance(replay, WindowReplay) else None
+        length = stride(log, measure_size(replay.model)) if isinstance(replay, SegmentReplay) else None
         # what repeats in no stride is in pieces of its own
         phase = ((log.time - log.time[0]) / (2 * comparison.stretch)).astype(np.int64)
-        if length is not None and isinstance(replay, WindowReplay) and replay.windows is not None:
+        if length is not None and isinstance(replay, SegmentReplay) and replay.segments is not None:
             found = True
-            count = max(round(length / segment_seconds(replay.windows, log)), FEWEST)
-            for a, b in replay.windows.rows:
+            count = max(round(length / segment_seconds(replay.segments, log)), FEWEST)
+            for a, b in replay.segments.rows:
                 middle = 0.5 * (log.time[a] + log.time[b - 1]) - log.time[0]
                 phase[a:b] = int(count * np.mod(middle / length, 1.0))
         labels += [(first + np.broadcast_to(phase[:, None], t.mask.shape))[t.mask] for t in comparison.targets]

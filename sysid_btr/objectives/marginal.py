@@ -1,4 +1,4 @@
-"""Windows whose starts are known within an uncertainty: what that uncertainty explains does not count.
+"""Segments whose starts are known within an uncertainty: what that uncertainty explains does not count.
 
 With residuals r + J d, d the start's error in standard deviations and r white, the residual's covariance is
 S = I + J J'. Whitening by the symmetric root of its inverse is the likelihood with the start integrated out
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """What the starts of windows can do to the sensors.
+    """What the starts of segments can do to the sensors.
 
     Attributes
     ----------
-    rows : (w, 2) first sample of each window, and the one after its last.
-    responses : for each window, channel -> (d, samples, joints of the replay): change of the sensors under one
+    rows : (w, 2) first sample of each segment, and the one after its last.
+    responses : for each segment, channel -> (d, samples, joints of the replay): change of the sensors under one
         standard deviation of each coordinate of the start.
-    weight : (w,) how much a window counts; below one where the model cannot explain it.
+    weight : (w,) how much a segment counts; below one where the model cannot explain it.
     shift : (w, d) where the starts lie already, in standard deviations from the mean of what is known of them.
     """
 
@@ -38,19 +38,19 @@ class Marginal:
     shift: FloatArray
 
     def chosen(self, which: IntArray) -> Marginal:
-        """Some of the windows."""
+        """Some of the segments."""
         return Marginal(
             self.rows[which], tuple(self.responses[i] for i in which), self.weight[which], self.shift[which]
         )
 
     def shifted(self, rows: int) -> Marginal:
-        """The same windows in a log that begins so many samples later."""
+        """The same segments in a log that begins so many samples later."""
         return Marginal(self.rows - rows, self.responses, self.weight, self.shift)
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """The whitening of one window's part of a residual vector.
+    """The whitening of one segment's part of a residual vector.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Projection:
     basis : (k, d) orthonormal directions that the start moves.
     gain : (d,) standard deviation along them, in noise.
     offset : (k,) change of the residual from the start as simulated to the one expected beforehand.
-    weight : of the window.
+    weight : of the segment.
     """
 
     columns: IntArray
@@ -76,14 +76,14 @@ class Projection:
         return np.asarray(self.weight * (expected - known)[:, 0])
 
 
-def sensitivity(marginal: Marginal, window: int, targets: Sequence[Target]) -> tuple[IntArray, FloatArray]:
-    """Positions of a window's samples in the residual vector, (k,), and their whitened responses, (k, d)."""
-    a, b = marginal.rows[window]
+def sensitivity(marginal: Marginal, segment: int, targets: Sequence[Target]) -> tuple[IntArray, FloatArray]:
+    """Positions of a segment's samples in the residual vector, (k,), and their whitened responses, (k, d)."""
+    a, b = marginal.rows[segment]
     columns, parts, offset = [], [], 0
     for target in targets:
         sample, joint = np.nonzero(target.mask)
         own = np.flatnonzero((sample >= a) & (sample < b))
-        response = marginal.responses[window][target.channel]
+        response = marginal.responses[segment][target.channel]
         columns.append(own + offset)
         # a residual is measured minus predicted
         moved = -response[:, sample[own] - a, target.columns[joint[own]]] / target.sigma[joint[own]]
@@ -93,7 +93,7 @@ def sensitivity(marginal: Marginal, window: int, targets: Sequence[Target]) -> t
 
 
 def projections(marginal: Marginal, targets: Sequence[Target]) -> tuple[Projection, ...]:
-    """Whitening of every window, for given noise levels."""
+    """Whitening of every segment, for given noise levels."""
     result = []
     for w in range(len(marginal.rows)):
         columns, moved = sensitivity(marginal, w, targets)

@@ -43,7 +43,7 @@ class Comparison:
 
     @cached_property
     def projections(self) -> tuple[Projection, ...]:
-        """Whitening of every window whose start is uncertain."""
+        """Whitening of every segment whose start is uncertain."""
         return () if self.marginal is None else projections(self.marginal, self.targets)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class Comparison:
         """
         white, result, first = self.whitened(outputs)[0], [], 0
         for projection in self.projections:
-            white[projection.columns] /= projection.weight  # every window counts in full
+            white[projection.columns] /= projection.weight  # every segment counts in full
         for target in self.targets:
             error = np.full(target.mask.shape, np.nan)
             last = first + int(target.mask.sum())

@@ -1,8 +1,8 @@
-"""Replay by windows: short stretches of a log, each from a state of its own, all in one batch (multiple shooting).
+"""Replay by segments: short stretches of a log, each from a state of its own, all in one batch (multiple shooting).
 
-A biped that is replayed from its first sample falls; a window of a few tenths of a second from a known state does
-not. Windows times candidates are the simulations of a batch. The outputs are those of a whole log, each sample
-predicted by the window it lies in, and NaN where there is none.
+A biped that is replayed from its first sample falls; a segment of a few tenths of a second from a known state does
+not. Segments times candidates are the simulations of a batch. The outputs are those of a whole log, each sample
+predicted by the segment it lies in, and NaN where there is none.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from sysid_btr.terms.base import Fields, Outputs
 SIMULATIONS = 96
 """Simulations of one batch."""
 LEAD = 0.25
-"""s of commands before a window that reach into it when they are delayed, by a bus, whatever the robot's size."""
+"""s of commands before a segment that reach into it when they are delayed, by a bus, whatever the robot's size."""
 BASE = 12
 """Numbers of a free base in a state: position, rotation, velocity, angular velocity, three each."""
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
-    """Windows of a log and the states from which they start.
+class Segments:
+    """Segments of a log and the states from which they start.
 
     Attributes
     ----------
-    rows : (w, 2) first sample of each window, and the one after its last.
+    rows : (w, 2) first sample of each segment, and the one after its last.
     position, velocity : (w, 3) of the base in the world.
     quaternion : (w, 4) of the base, scalar first.
     rate : (w, 3) angular velocity in the base's frame.
@@ -55,15 +55,15 @@ class Windows:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def chosen(self, which: IntArray) -> Windows:
-        """Some of the windows."""
-        return Windows(*(getattr(self, name)[which] for name in _WINDOW_FIELDS))
+    def chosen(self, which: IntArray) -> Segments:
+        """Some of the segments."""
+        return Segments(*(getattr(self, name)[which] for name in _FIELDS))
 
-    def shifted(self, rows: int) -> Windows:
-        """The same windows in a log that begins so many samples later."""
+    def shifted(self, rows: int) -> Segments:
+        """The same segments in a log that begins so many samples later."""
         return replace(self, rows=self.rows - rows)
 
-    def moved(self, change: FloatArray) -> Windows:
+    def moved(self, change: FloatArray) -> Segments:
         """Starts changed by small amounts in the coordinates of `std`, (w, 12 + 2 j)."""
         from scipy.spatial.transform import Rotation
 
@@ -80,7 +80,7 @@ class Windows:
         )
 
 
-def on_slope(starts: Windows, level: FloatArray, tilted: FloatArray) -> Windows:
+def on_slope(starts: Segments, level: FloatArray, tilted: FloatArray) -> Segments:
     """Starts on a floor to which gravity is not normal.
 
     The inertial unit knows the base's attitude to gravity, so where gravity is tilted in the floor's frame the base
@@ -109,12 +109,12 @@ def on_slope(starts: Windows, level: FloatArray, tilted: FloatArray) -> Windows:
     )
 
 
-_WINDOW_FIELDS = ("rows", "position", "quaternion", "velocity", "rate", "joint_position", "joint_velocity", "std")
+_FIELDS = ("rows", "position", "quaternion", "velocity", "rate", "joint_position", "joint_velocity", "std")
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """Where a window lies on the log's grid: first border, and its samples relative to that."""
+    """Where a segment lies on the log's grid: first border, and its samples relative to that."""
 
     first: int
     before: IntArray
@@ -129,28 +129,28 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class WindowReplay(Replay):
-    """A log replayed by windows.
+class SegmentReplay(Replay):
+    """A log replayed by segments.
 
     Attributes
     ----------
-    windows : stretches and states; for the joints in the order of `index.joints`.
+    segments : stretches and states; for the joints in the order of `index.joints`.
     """
 
-    windows: Windows | None = None
+    segments: Segments | None = None
 
     @cached_property
-    def _windows(self) -> Windows:
-        if self.windows is None:
+    def _segments(self) -> Segments:
+        if self.segments is None:
             raise ValueError("a segmented replay needs segments")
-        return self.windows
+        return self.segments
 
     @cached_property
     def _frames(self) -> list[_Frame]:
         grid = self.grid
         low, high = grid.state[grid.before], grid.state[grid.after]
         frames = []
-        for a, b in self._windows.rows:
+        for a, b in self._segments.rows:
             first = int(low[a])
             frames.append(
                 _Frame(
@@ -164,16 +164,16 @@ class WindowReplay(Replay):
         return frames
 
     def _run(self, candidates: FloatArray) -> Outputs:
-        m, w = len(candidates), len(self._windows)
+        m, w = len(candidates), len(self._segments)
         n, joints = len(self.log), len(self.index.joints)
         shape = (m, n, joints)
         position, velocity = np.full(shape, np.nan), np.full(shape, np.nan)
         effort = np.full(shape, np.nan) if self.effort else None
-        # candidates of one window side by side: they share its commands
-        row, window = np.tile(np.arange(m), w), np.repeat(np.arange(w), m)
-        for sims, part in self._simulate(candidates, row, window, None):
+        # candidates of one segment side by side: they share its commands
+        row, segment = np.tile(np.arange(m), w), np.repeat(np.arange(w), m)
+        for sims, part in self._simulate(candidates, row, segment, None):
             for s, i in enumerate(sims):
-                a, b = self._windows.rows[window[i]]
+                a, b = self._segments.rows[segment[i]]
                 position[row[i], a:b] = part.position[s]
                 velocity[row[i], a:b] = part.velocity[s]
                 if effort is not None and part.effort is not None:
@@ -181,33 +181,33 @@ class WindowReplay(Replay):
         return Outputs(self.grid.sample_time, position, velocity, effort)
 
     def respond(self, values: FloatArray, directions: FloatArray) -> Iterator[tuple[int, Outputs]]:
-        """Sensors in each window under changes of its start.
+        """Sensors in each segment under changes of its start.
 
         Parameters
         ----------
         values : (p,) the candidate.
-        directions : (d, 12 + 2 j) or (w, d, 12 + 2 j) changes, in the coordinates of `Windows.std`.
+        directions : (d, 12 + 2 j) or (w, d, 12 + 2 j) changes, in the coordinates of `Segments.std`.
 
         Yields
         ------
         (int, Outputs)
-            Window, and sensors (d, samples of the window, joints).
+            Segment, and sensors (d, samples of the segment, joints).
         """
-        w = len(self._windows)
+        w = len(self._segments)
         wide = np.broadcast_to(directions, (w, *directions.shape[-2:]))
         d = wide.shape[1]
-        row, window = np.zeros(w * d, dtype=np.int64), np.repeat(np.arange(w), d)
+        row, segment = np.zeros(w * d, dtype=np.int64), np.repeat(np.arange(w), d)
         change = wide.reshape(w * d, -1)
         waiting: dict[int, list[tuple[int, Outputs, int]]] = {}
-        for sims, part in self._simulate(values[None], row, window, change):
+        for sims, part in self._simulate(values[None], row, segment, change):
             for s, i in enumerate(sims):
-                own = waiting.setdefault(int(window[i]), [])
+                own = waiting.setdefault(int(segment[i]), [])
                 own.append((int(i), part, s))
                 if len(own) == d:
                     own.sort(key=lambda item: item[0])
                     efforts = [p.effort[k] for _, p, k in own if p.effort is not None]
                     yield (
-                        int(window[i]),
+                        int(segment[i]),
                         Outputs(
                             part.time,
                             np.stack([p.position[k] for _, p, k in own]),
@@ -215,17 +215,17 @@ class WindowReplay(Replay):
                             np.stack(efforts) if efforts else None,
                         ),
                     )
-                    del waiting[int(window[i])]
+                    del waiting[int(segment[i])]
 
     def _simulate(
-        self, candidates: FloatArray, row: IntArray, window: IntArray, change: FloatArray | None
+        self, candidates: FloatArray, row: IntArray, segment: IntArray, change: FloatArray | None
     ) -> Iterator[tuple[IntArray, Outputs]]:
-        """Simulations (candidate, window, change of its start), in batches of windows with the same sample times."""
+        """Simulations (candidate, segment, change of its start), in batches of segments with the same sample times."""
         pairs = self._values(candidates)
-        # a torque known in advance is known on the log's clock, so its windows cannot share a batch
+        # a torque known in advance is known on the log's clock, so its segments cannot share a batch
         alone = any(type(term).overrides("applied_torque") for term, _ in pairs)
         groups: dict[object, list[int]] = {}
-        for i, w in enumerate(window):
+        for i, w in enumerate(segment):
             groups.setdefault(int(w) if alone else self._frames[w].key, []).append(i)
         for members in groups.values():
             for first in range(0, len(members), SIMULATIONS):
@@ -234,14 +234,14 @@ class WindowReplay(Replay):
                     sims,
                     self._block(
                         [(term, values[row[sims]]) for term, values in pairs],
-                        window[sims],
+                        segment[sims],
                         None if change is None else change[sims],
                     ),
                 )
 
-    def _block(self, pairs: Values, window: IntArray, change: FloatArray | None) -> Outputs:
+    def _block(self, pairs: Values, segment: IntArray, change: FloatArray | None) -> Outputs:
         """One batch of simulations that share their sample times."""
-        frame = self._frames[window[0]]
+        frame = self._frames[segment[0]]
         h, steps = self.grid.timestep, max(int(frame.after[-1]), 1)
         local = Grid(
             timestep=h,
@@ -252,12 +252,12 @@ class WindowReplay(Replay):
             after=frame.after,
             fraction=frame.fraction,
         )
-        return self._go(self._setup(pairs, window, change, steps), pairs, local)
+        return self._go(self._setup(pairs, segment, change, steps), pairs, local)
 
-    def _setup(self, pairs: Values, window: IntArray, change: FloatArray | None, steps: int) -> Setup:
-        """Windows from their initial states, with `change` added to these."""
-        frame, h = self._frames[window[0]], self.grid.timestep
-        starts = self._windows.chosen(window)
+    def _setup(self, pairs: Values, segment: IntArray, change: FloatArray | None, steps: int) -> Setup:
+        """Segments from their initial states, with `change` added to these."""
+        frame, h = self._frames[segment[0]], self.grid.timestep
+        starts = self._segments.chosen(segment)
         if change is not None:
             starts = starts.moved(change[:, : starts.std.shape[1]])
         if frame.late:
@@ -266,10 +266,10 @@ class WindowReplay(Replay):
             late[:, :3], late[:, 3:6] = -frame.late * starts.velocity, -frame.late * starts.rate
             late[:, BASE : BASE + joints] = -frame.late * starts.joint_velocity
             starts = starts.moved(late)
-        batch = self.batch(pairs, len(window))
+        batch = self.batch(pairs, len(segment))
         if "opt.gravity" in batch.fields:
             starts = on_slope(starts, np.array(self.model.opt.gravity), batch.read("opt.gravity"))
-        first = np.array([self._frames[w].first for w in window])
+        first = np.array([self._frames[w].first for w in segment])
         lead = round(LEAD / h)
         rows = np.clip(first[:, None] + np.arange(-lead, steps), 0, self.grid.steps - 1)
         setup = prepare(
@@ -288,10 +288,10 @@ class WindowReplay(Replay):
         qpos, qvel = setup.state["qpos"], setup.state["qvel"]
         qpos[:, place : place + 3], qpos[:, place + 3 : place + 7] = starts.position, starts.quaternion
         qvel[:, motion : motion + 3], qvel[:, motion + 3 : motion + 6] = starts.velocity, starts.rate
-        return replace(setup, state={**setup.state, **self.push(window, change)})
+        return replace(setup, state={**setup.state, **self.push(segment, change)})
 
-    def push(self, window: IntArray, change: FloatArray | None) -> Fields:
-        """Forces from outside on a batch of windows, as in MjData; none here."""
+    def push(self, segment: IntArray, change: FloatArray | None) -> Fields:
+        """Forces from outside on a batch of segments, as in MjData; none here."""
         return {}
 
     @cached_property

@@ -13,7 +13,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.models.robot import Robot
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.compiling import LIFT
-from sysid_btr.simulation.segments import LEAD, WindowReplay
+from sysid_btr.simulation.segments import LEAD, SegmentReplay
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import BatchModel, Term
 from sysid_btr.writeback.rewrite import unequal
@@ -68,7 +68,7 @@ def of_file(problem: ReplayProblem, path: Path) -> ReplayProblem:
     episodes = []
     for episode in problem.episodes:
         was = episode.replay
-        lead = round(LEAD / was.numerics.timestep) if isinstance(was, WindowReplay) else 0
+        lead = round(LEAD / was.numerics.timestep) if isinstance(was, SegmentReplay) else 0
         replay = replace(was, robot=robot, terms=(FilledBuffers(places=(), lead=lead),))
         episodes.append(replace(episode, replay=replay))
     return ReplayProblem(tuple(episodes), np.zeros(0))
