@@ -353,7 +353,7 @@ def test_what_trials_do_not_tell_stays_as_it_was() -> None:
     residuals = problem.residuals(candidates)
     np.testing.assert_allclose(residuals[:, -3:], [[0, 0, 0], [1, 1, 1]], atol=1e-12)
     np.testing.assert_allclose(problem.loss(candidates), (residuals**2).sum(axis=1))
-    np.testing.assert_allclose(residuals[:, :-3], problem.data.residuals(candidates))
+    np.testing.assert_allclose(residuals[:, :-3], problem.problem.residuals(candidates))
     assert np.isnan(problem.residuals(np.full((1, 3), np.nan))).all()
 
 

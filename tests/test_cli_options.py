@@ -139,7 +139,7 @@ def test_the_fingerprint_covers_all_that_decides_which_candidates_are_evaluated(
     other = replace(plain, **{name: value})
     assert getattr(other, name) != getattr(plain, name)
     if name == "model":  # it is known by its content
-        robot = replace(robot, digest="another")
+        robot = replace(robot, make_spec=load_robot("emps").make_spec)
     same = fingerprint(verb, other, robot) == fingerprint(verb, plain, load_robot(MODEL))  # type: ignore[arg-type]
     assert same == (name in DECIDES_NOTHING)
     assert one.decides == (name not in DECIDES_NOTHING)
