@@ -26,6 +26,7 @@ dev: $(VENV)/installed-dev
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check --quiet $(SOURCES)
 	$(BIN)/lint-imports --no-logo
 
 types: $(VENV)/installed-dev

@@ -33,10 +33,7 @@ RANGE = (0.75, 1.25)
 TASK = Walk(3.0)
 CLOSE_ENOUGH = 0.05
 """Relative error of a length, median over seeds, that is to be reached."""
-MODELS = {
-    "ga": papers_model_search(),
-    "cmaes": model_search(),
-}
+MODELS = {"ga": papers_model_search(), "cmaes": model_search()}
 
 
 @dataclass(frozen=True)

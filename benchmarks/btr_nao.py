@@ -58,10 +58,7 @@ CONTROLLERS: Mapping[str, Callable[[int], tuple[Estimator, Estimator]]] = {
     "cmaes": cma_controller_searches,
 }
 """Step 1 in the first iteration and in the others, by its generations of 20."""
-MODELS: Mapping[str, Estimator] = {
-    "lsq": model_fit(),
-    "cmaes": CmaEs(population=12, max_generations=8, sigma=0.1),
-}
+MODELS: Mapping[str, Estimator] = {"lsq": model_fit(), "cmaes": CmaEs(population=12, max_generations=8, sigma=0.1)}
 FRICTIONS = ("coulomb_friction", "stribeck_friction", "load_friction")
 
 

@@ -42,22 +42,15 @@ def _pair(joint: str) -> tuple[str, str]:
 
 GANTRY: dict[str, Truth] = {
     "a": Truth(
-        (
-            CoulombFriction(where=_pair("AnklePitch"), torque=0.25),
-            CoulombFriction(where=_pair("HipRoll"), torque=0.3),
-        ),
+        (CoulombFriction(where=_pair("AnklePitch"), torque=0.25), CoulombFriction(where=_pair("HipRoll"), torque=0.3)),
         1.1,
         {"RHipPitch": 1.2, "LHipPitch": 1.15, "RKneePitch": 0.85, "LKneePitch": 0.8, "kp": 0.92},
     ),
     "b": Truth((CommandDelay(delay=0.025),), 1.1, {"RShoulderRoll": 1.25, "LShoulderRoll": 0.85, "kp": 1.08}),
     "c": Truth((), 1.1, {"RKneePitch": 1.25, "LKneePitch": 0.8, "RHipPitch": 0.9, "kp": 0.9}),
     "d": Truth((Backlash(where=_pair("KneePitch"), play=0.03),), 1.3, {"LHipPitch": 1.2}),
-    "e": Truth(
-        (Payload(where=("RElbowRoll",), mass=0.18, offset=(0.06, 0.0, 0.0)),), 1.1, {"RKneePitch": 1.2}
-    ),
-    "f": Truth(
-        (SpeedTorqueLimit(where=_pair("ShoulderPitch"), stall=0.8, no_load_speed=7.0),), 1.3, {"kp": 1.05}
-    ),
+    "e": Truth((Payload(where=("RElbowRoll",), mass=0.18, offset=(0.06, 0.0, 0.0)),), 1.1, {"RKneePitch": 1.2}),
+    "f": Truth((SpeedTorqueLimit(where=_pair("ShoulderPitch"), stall=0.8, no_load_speed=7.0),), 1.3, {"kp": 1.05}),
 }
 
 
@@ -73,9 +66,7 @@ class Outcome:
     @property
     def over_floor(self) -> float:
         """Held-out position rmse over the noise floor."""
-        return float(
-            self.result["after"]["holdout"]["position"]["rmse"] / self.result["noise_floor"]["position"]
-        )
+        return float(self.result["after"]["holdout"]["position"]["rmse"] / self.result["noise_floor"]["position"])
 
     @property
     def problems(self) -> list[str]:
@@ -102,9 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"no recording {', '.join(sorted(unknown))}; there are {', '.join(GANTRY)}")
     folder = data_folder() / "nao_gantry"
     if not (folder / "nominal.xml").exists():
-        print(
-            f"no recordings in {folder}; set SYSID_BTR_DATA to the folder that holds nao_gantry. Nothing to do."
-        )
+        print(f"no recordings in {folder}; set SYSID_BTR_DATA to the folder that holds nao_gantry. Nothing to do.")
         return 0
     outcomes = []
     for letter in options.letters or GANTRY:

@@ -157,11 +157,7 @@ def throughput(case: Case, repeats: int) -> dict[str, Any]:
 
 def memory() -> dict[str, Any]:
     """Peak resident memory of many long candidates, each way of using them in a process of its own."""
-    result: dict[str, Any] = {
-        "candidates": MEMORY_CANDIDATES,
-        "seconds": MEMORY_SECONDS,
-        "target_mb": 1000,
-    }
+    result: dict[str, Any] = {"candidates": MEMORY_CANDIDATES, "seconds": MEMORY_SECONDS, "target_mb": 1000}
     for way in ("nothing", "loss", "chunks"):
         command = [sys.executable, "-m", "benchmarks.replay", "--measure-memory", way]
         result[way] = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)

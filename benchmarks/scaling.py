@@ -180,11 +180,7 @@ AXES = (
     Axis("fit, length of the log", "s", (5, 10, 20, 40), lambda x: fit_job(nao(), single_gains(4), x), "1"),
     Axis("fit, joints", "joints", (4, 8, 16, 32), lambda x: fit_job(comb(int(x)), ["kp:*"]), "1 to 2"),
     Axis(
-        "fit, parameters",
-        "parameters",
-        (1, 2, 4, 8, 16, 22),
-        lambda x: fit_job(nao(), single_gains(int(x))),
-        "0 to 1",
+        "fit, parameters", "parameters", (1, 2, 4, 8, 16, 22), lambda x: fit_job(nao(), single_gains(int(x))), "0 to 1"
     ),
     Axis("fit, logs", "logs", (1, 2, 4, 8), lambda x: fit_job(nao(), single_gains(4), 5.0, int(x)), "1"),
 )

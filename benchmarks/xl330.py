@@ -96,14 +96,10 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     def tell(*, done: int, total: int | None, best: float, note: str) -> None:
         sys.stderr.write(f"{perf_counter() - began:6.0f} s  {fold}: {note}\n")
 
-    study = make_study(
-        xl330(), kept, channels=("position",), numerics=Numerics("RK4", SEARCH), threads=1
-    )
+    study = make_study(xl330(), kept, channels=("position",), numerics=Numerics("RK4", SEARCH), threads=1)
     found = close(study, list(DECLARED), effects=effects, progress=tell, selection=Selection(minimum_gain=MINIMUM_GAIN))
     # every log in full, and all alike
-    whole = make_study(
-        xl330(), logs, channels=("position",), numerics=Numerics("RK4", FINAL), threads=1
-    )
+    whole = make_study(xl330(), logs, channels=("position",), numerics=Numerics("RK4", FINAL), threads=1)
     names = [Path(str(log.path)).stem for log in logs]
     whole = replace(whole, train=tuple(logs), inflation={})
     fitted = replace(whole, train=tuple(kept))
@@ -111,12 +107,7 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "found": [
-            {
-                "effect": e.effect,
-                "variant": e.variant,
-                "sentence": e.sentence,
-                "confused_with": list(e.confused_with),
-            }
+            {"effect": e.effect, "variant": e.variant, "sentence": e.sentence, "confused_with": list(e.confused_with)}
             for e in found.effects
         ],
         "steps": [" ".join((*s.added, *(f"- {r}" for r in s.removed))) for s in found.steps],

@@ -32,37 +32,21 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--robot", help="MJCF file, or six_joint_leg, or pendulum")
-    parser.add_argument(
-        "--out", type=Path, help="Parquet file; the truth goes to <stem>.truth.json beside it"
-    )
+    parser.add_argument("--out", type=Path, help="Parquet file; the truth goes to <stem>.truth.json beside it")
     parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     parser.add_argument("--motion", default="multisine", choices=sorted(MOTIONS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--rate", type=float, default=100.0, help="commands and samples a second")
-    parser.add_argument(
-        "--effect", action="append", default=[], metavar="EFFECT", help="repeatable; see below"
-    )
-    parser.add_argument(
-        "--mass", action="append", default=[], metavar="BODY=FACTOR", help="repeatable, globs"
-    )
-    parser.add_argument(
-        "--kp", action="append", default=[], metavar="[JOINT=]FACTOR", help="repeatable, globs"
-    )
-    parser.add_argument(
-        "--kv", action="append", default=[], metavar="[JOINT=]FACTOR", help="repeatable, globs"
-    )
+    parser.add_argument("--effect", action="append", default=[], metavar="EFFECT", help="repeatable; see below")
+    parser.add_argument("--mass", action="append", default=[], metavar="BODY=FACTOR", help="repeatable, globs")
+    parser.add_argument("--kp", action="append", default=[], metavar="[JOINT=]FACTOR", help="repeatable, globs")
+    parser.add_argument("--kv", action="append", default=[], metavar="[JOINT=]FACTOR", help="repeatable, globs")
     parser.add_argument("--step", type=float, default=5.0e-4, help="step of the plant, s")
-    parser.add_argument(
-        "--servo-period", type=float, help="digital servo of this period, s (default: continuous)"
-    )
-    parser.add_argument(
-        "--preroll", type=float, default=0.0, help="seconds spent at the first command before 0"
-    )
+    parser.add_argument("--servo-period", type=float, help="digital servo of this period, s (default: continuous)")
+    parser.add_argument("--preroll", type=float, default=0.0, help="seconds spent at the first command before 0")
     parser.add_argument("--log", default="", metavar="velocity,effort,imu", help="channels besides position")
-    parser.add_argument(
-        "--list", action="store_true", help="print the effects and their parameters, and stop"
-    )
+    parser.add_argument("--list", action="store_true", help="print the effects and their parameters, and stop")
     return parser
 
 

@@ -51,9 +51,7 @@ class Effect:
         found = tuple(dict.fromkeys(n for p in self.where or ("*",) for n in names if fnmatchcase(n, p)))
         for pattern in self.where:
             if not any(fnmatchcase(n, pattern) for n in names):
-                raise ValueError(
-                    f"{self.name}: no {self.acts_on} matches {pattern!r}; there are {', '.join(names)}"
-                )
+                raise ValueError(f"{self.name}: no {self.acts_on} matches {pattern!r}; there are {', '.join(names)}")
         return replace(self, where=found)
 
     def truth(self) -> dict[str, Any]:

@@ -102,9 +102,7 @@ class Assembly:
     breaks: list[float] = field(default_factory=list)  # s; instants at which an input switches
     loop_scale: Array | None = None  # the servo sees loop_scale * q + loop_offset
     loop_offset: Array | None = None
-    sensors: list[Callable[[Array, Array, Array], None]] = field(
-        default_factory=list
-    )  # change t, q, v as read
+    sensors: list[Callable[[Array, Array, Array], None]] = field(default_factory=list)  # change t, q, v as read
     read_delay: Array | None = None
 
     def add_state(self, start: Array, derivative: Callable[[State], Array]) -> slice:
@@ -132,13 +130,7 @@ class Plant:
     """An assembled robot, ready to run once from rest at `start` (n,)."""
 
     def __init__(
-        self,
-        assembly: Assembly,
-        *,
-        start: Array,
-        grid: Array,
-        sample_period: float,
-        servo_period: float | None,
+        self, assembly: Assembly, *, start: Array, grid: Array, sample_period: float, servo_period: float | None
     ) -> None:
         import pinocchio as pin
 
@@ -150,9 +142,7 @@ class Plant:
         g = self.gap.joints
         armature = robot.armature.copy()
         if g.size and not (armature[g] > 0.0).all():
-            raise ValueError(
-                "a joint with backlash or compliance needs an armature: it is the motor's inertia"
-            )
+            raise ValueError("a joint with backlash or compliance needs an armature: it is the motor's inertia")
         self.rotor = armature[g]
         armature[g] = 0.0
         self.model = build_pinocchio(robot, armature)
@@ -405,9 +395,7 @@ class Plant:
             travel = np.maximum(before[turned] * self.direction[turned], 0.0)
             share = travel / (travel - after[turned] * self.direction[turned])
             first = float(share.min())
-            if (
-                tries > 4 * self.n + 8
-            ):  # joints that keep each other slipping and sticking: hold them to the border
+            if tries > 4 * self.n + 8:  # joints that keep each other slipping and sticking: hold them to the border
                 barred[turned] = True
             if first > 1e-6:
                 reached = done + first * (1.0 - done)

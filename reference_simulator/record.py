@@ -122,9 +122,7 @@ def _measure(spec: Recording) -> tuple[Array, dict[str, Array], dict[str, Array]
         return np.asarray(commands[now])
 
     first = -spec.preroll
-    last = (
-        float(time[-1]) + spec.step
-    )  # one step past the last sample, whose effort belongs to its own command
+    last = float(time[-1]) + spec.step  # one step past the last sample, whose effort belongs to its own command
     assembly = Assembly(robot=robot, command=held, duration=last, rng=effect_rng, breaks=list(time))
     for effect in effects:
         effect.attach(assembly)
@@ -134,9 +132,7 @@ def _measure(spec: Recording) -> tuple[Array, dict[str, Array], dict[str, Array]
     if spec.servo_period:
         breaks.append(np.arange(0.0, last, spec.servo_period))
     grid = step_grid(first, last, spec.step, np.concatenate(breaks))
-    plant = Plant(
-        assembly, start=commands[0], grid=grid, sample_period=period, servo_period=spec.servo_period
-    )
+    plant = Plant(assembly, start=commands[0], grid=grid, sample_period=period, servo_period=spec.servo_period)
     exact = _readings(spec.sensors, assembly, plant.run(), time, commands)
     channels = {name: value.copy() for name, value in exact.items()}
     for name, value in channels.items():
@@ -178,9 +174,7 @@ def _true_robot(nominal: Robot, spec: Recording) -> tuple[Robot, dict[str, Array
     return robot, factors
 
 
-def _readings(
-    sensors: Sensors, assembly: Assembly, path: Trajectory, time: Array, commands: Array
-) -> dict[str, Array]:
+def _readings(sensors: Sensors, assembly: Assembly, path: Trajectory, time: Array, commands: Array) -> dict[str, Array]:
     """What perfect sensors log: commands, positions and the optional channels, by column name."""
     joints = assembly.robot.joints
     late = np.zeros(len(joints)) if assembly.read_delay is None else assembly.read_delay

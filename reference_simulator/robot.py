@@ -47,9 +47,7 @@ class Body:
         """The same body with a point mass (kg) attached at `offset` (m, body frame)."""
         total = self.mass + mass
         com = (self.mass * self.com + mass * offset) / total
-        inertia = (
-            self.inertia + _point_inertia(self.mass, self.com - com) + _point_inertia(mass, offset - com)
-        )
+        inertia = self.inertia + _point_inertia(self.mass, self.com - com) + _point_inertia(mass, offset - com)
         return replace(self, mass=total, com=com, inertia=inertia)
 
 
@@ -94,9 +92,7 @@ class Robot:
         for body in self.bodies:
             if body.name == name:
                 return body
-        raise KeyError(
-            f"no body {name!r} in {self.path.name}; bodies: {', '.join(b.name for b in self.bodies)}"
-        )
+        raise KeyError(f"no body {name!r} in {self.path.name}; bodies: {', '.join(b.name for b in self.bodies)}")
 
     def with_bodies(self, changed: Mapping[str, Body]) -> Robot:
         """The same robot with the named bodies replaced."""
@@ -110,9 +106,7 @@ class Robot:
             return np.arange(self.n)
         unknown = [name for name in names if name not in self.joints]
         if unknown:
-            raise KeyError(
-                f"no joint {', '.join(unknown)} in {self.path.name}; joints: {', '.join(self.joints)}"
-            )
+            raise KeyError(f"no joint {', '.join(unknown)} in {self.path.name}; joints: {', '.join(self.joints)}")
         return np.array([self.joints.index(name) for name in names])
 
 
@@ -134,18 +128,14 @@ def load_robot(source: str | Path) -> Robot:
     hinge, slide = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
     for j in range(m.njnt):
         if m.jnt_type[j] not in (hinge, slide):
-            raise ValueError(
-                f"{path.name}: joint {m.joint(j).name!r} is neither hinge nor slide; hold the torso"
-            )
+            raise ValueError(f"{path.name}: joint {m.joint(j).name!r} is neither hinge nor slide; hold the torso")
     kp, kv, limit = np.zeros(m.nv), np.zeros(m.nv), np.full(m.nv, np.inf)
     for a in range(m.nu):
         j = int(m.actuator_trnid[a, 0])
         gain, bias = m.actuator_gainprm[a], m.actuator_biasprm[a]
         simple = m.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT) and m.actuator_gear[a, 0] == 1.0
         if not simple or bias[0] != 0.0 or bias[1] != -gain[0]:
-            raise ValueError(
-                f"{path.name}: actuator {m.actuator(a).name!r} is not a position servo with gear 1"
-            )
+            raise ValueError(f"{path.name}: actuator {m.actuator(a).name!r} is not a position servo with gear 1")
         kp[j], kv[j] = gain[0], -bias[2]
         if m.actuator_forcelimited[a]:
             limit[j] = m.actuator_forcerange[a, 1]
@@ -214,9 +204,7 @@ def build_pinocchio(robot: Robot, armature: Array | None = None) -> Any:
 
     model = pin.Model()
     model.gravity.linear = robot.gravity
-    carrier: list[
-        tuple[int, Any]
-    ] = []  # for each body: Pinocchio joint, and the body frame in that joint's frame
+    carrier: list[tuple[int, Any]] = []  # for each body: Pinocchio joint, and the body frame in that joint's frame
     for body in robot.bodies:
         parent, frame = (0, pin.SE3.Identity()) if body.parent < 0 else carrier[body.parent]
         frame = frame * pin.SE3(body.placement)
@@ -226,10 +214,7 @@ def build_pinocchio(robot: Robot, armature: Array | None = None) -> Any:
             if robot.sliding[j]:
                 back, kind = pin.SE3(np.eye(3), -ref * axis), pin.JointModelPrismaticUnaligned(axis)
             else:
-                back, kind = (
-                    pin.SE3(pin.exp3(-ref * axis), np.zeros(3)),
-                    pin.JointModelRevoluteUnaligned(axis),
-                )
+                back, kind = (pin.SE3(pin.exp3(-ref * axis), np.zeros(3)), pin.JointModelRevoluteUnaligned(axis))
             parent = model.addJoint(parent, kind, frame * shift * back, robot.joints[j])
             if model.joints[parent].idx_v != j:
                 raise ValueError(f"joint {robot.joints[j]!r} changed its place in the order of joints")

@@ -43,11 +43,7 @@ SAMPLES: dict[str, Recording] = {
     ),
     "pendulum_clean": Recording(PENDULUM, seed=31, seconds=10.0, mass={"arm": 1.1}, kp=0.95),
     "pendulum_friction": Recording(
-        PENDULUM,
-        seed=32,
-        seconds=10.0,
-        motion="poses",
-        effects=(parse_effect("coulomb_friction:torque=0.2"),),
+        PENDULUM, seed=32, seconds=10.0, motion="poses", effects=(parse_effect("coulomb_friction:torque=0.2"),)
     ),
     "pendulum_weak": Recording(
         PENDULUM,

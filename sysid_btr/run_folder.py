@@ -175,9 +175,7 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(
-            f"--out {path} cannot be created: {error.strerror}; choose another folder"
-        ) from error
+        raise UsageError(f"--out {path} cannot be created: {error.strerror}; choose another folder") from error
     folder = Folder(path, _locked(path))
     if folder.held and not (resume or overwrite):
         raise UsageError(

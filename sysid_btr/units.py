@@ -8,11 +8,7 @@ from collections.abc import Sequence
 PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 PREFIXED = ("rad", "m", "rad/s", "m/s", "Nm", "N", "s")
 """Units that people read with a prefix."""
-CHANNEL_UNITS = {
-    "position": ("rad", "m"),
-    "velocity": ("rad/s", "m/s"),
-    "effort": ("Nm", "N"),
-}
+CHANNEL_UNITS = {"position": ("rad", "m"), "velocity": ("rad/s", "m/s"), "effort": ("Nm", "N")}
 """Unit of a channel for hinges and for slides."""
 
 
@@ -39,8 +35,7 @@ def si_all(values: Sequence[float | None], unit: str, digits: int = 3) -> list[s
         return [si(v, unit, digits) for v in values]
     factor, prefix = _prefix(max(known))
     return [
-        "unknown" if v is None or not math.isfinite(v) else f"{v / factor:.{digits}g} {prefix}{unit}"
-        for v in values
+        "unknown" if v is None or not math.isfinite(v) else f"{v / factor:.{digits}g} {prefix}{unit}" for v in values
     ]
 
 

@@ -62,9 +62,7 @@ def make_good_log(seed: int = 0, n: int = 800, period: float = 0.01) -> Log:
     for axis, value in zip("xyz", (0.0, 0.0, 9.81), strict=True):
         channels[f"imu.acc_{axis}"] = value + rng.normal(scale=0.05, size=n)
     channels["force.LFoot"] = np.maximum(0.0, 25 * np.sin(4 * time)) + np.abs(rng.normal(scale=0.1, size=n))
-    meta = LogMeta(
-        robot="toy", mount="free", sample_period=period, source="synthetic", extra={"operator": "me"}
-    )
+    meta = LogMeta(robot="toy", mount="free", sample_period=period, source="synthetic", extra={"operator": "me"})
     return Log(time=time, channels=channels, meta=meta, episode=np.zeros(n, dtype=np.int64))
 
 

@@ -202,9 +202,7 @@ BASE = ("{desk}/walk.csv", "--map", "{desk}/mapping.toml")
     ],
     ids=lambda value: " ".join(value)[-60:] if isinstance(value, tuple) else None,
 )
-def test_every_mistake_is_one_clear_message(
-    cli: Cli, desk: Path, argv: tuple[str, ...], code: int, said: str
-) -> None:
+def test_every_mistake_is_one_clear_message(cli: Cli, desk: Path, argv: tuple[str, ...], code: int, said: str) -> None:
     import re
 
     (desk / "there.parquet").write_text("mine")
@@ -218,9 +216,7 @@ def test_every_mistake_is_one_clear_message(
     assert {path: path.read_bytes() for path in desk.iterdir()} == files
 
 
-@pytest.mark.parametrize(
-    ("number", "said"), [(errno.ENOSPC, "No space left"), (errno.EACCES, "Permission denied")]
-)
+@pytest.mark.parametrize(("number", "said"), [(errno.ENOSPC, "No space left"), (errno.EACCES, "Permission denied")])
 def test_no_space_and_no_permission_are_told_and_leave_nothing(
     cli: Cli, desk: Path, monkeypatch: pytest.MonkeyPatch, number: int, said: str
 ) -> None:
@@ -305,9 +301,7 @@ def test_the_study_file_says_what_the_log_holds(swinging: Path) -> None:
 
 
 def test_only_what_moved_is_proposed_to_be_freed(cli: Cli, tmp_path: Path, leg: Log) -> None:
-    still = {
-        f"{c}.{j}": np.zeros(len(leg)) for c in ("command", "position") for j in ("HipYawPitch", "HipRoll")
-    }
+    still = {f"{c}.{j}": np.zeros(len(leg)) for c in ("command", "position") for j in ("HipYawPitch", "HipRoll")}
     noise = np.random.default_rng(0).normal(scale=1e-4, size=(2, len(leg)))
     still["position.HipYawPitch"], still["position.HipRoll"] = noise
     write_log(replace(leg, channels={**leg.channels, **still}), tmp_path / "log.parquet")
@@ -344,16 +338,8 @@ def test_several_logs_make_one_study(cli: Cli) -> None:
         (("--model", str(LEG)), 2, "which log"),
         (("{desk}/walk.csv", "--model", str(LEG)), 3, "sysid-btr import"),
         ((str(SAMPLES / "leg_clean.parquet"), "--model", str(PENDULUM)), 4, "--rename"),
-        (
-            (str(SAMPLES / "leg_clean.parquet"), "--model", str(LEG), "--out", "{desk}/mapping.toml"),
-            2,
-            "--overwrite",
-        ),
-        (
-            (str(SAMPLES / "leg_clean.parquet"), "--model", str(LEG), "--out", "{desk}/no/s.toml"),
-            2,
-            "create it",
-        ),
+        ((str(SAMPLES / "leg_clean.parquet"), "--model", str(LEG), "--out", "{desk}/mapping.toml"), 2, "--overwrite"),
+        ((str(SAMPLES / "leg_clean.parquet"), "--model", str(LEG), "--out", "{desk}/no/s.toml"), 2, "create it"),
     ],
     ids=["nothing", "no log", "foreign", "other robot", "there", "no folder"],
 )

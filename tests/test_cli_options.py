@@ -125,7 +125,7 @@ def test_a_study_file_is_read_as_its_options_say(tmp_path: Path) -> None:
 
 
 def test_text_of_a_study_file_is_read_as_it_was_written() -> None:
-    for text in ("a\"b\\c", "tab\tnew\nline", "del\x7f", "Gelenk äß 日本"):
+    for text in ('a"b\\c', "tab\tnew\nline", "del\x7f", "Gelenk äß 日本"):
         assert tomllib.loads(f"a = {toml([text])}")["a"] == [text]
 
 

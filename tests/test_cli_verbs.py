@@ -51,10 +51,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     meta = LogMeta(robot="arm", sample_period=period, source="test")
     told = Log(time_, {"command.hinge": command}, meta, np.zeros(n, dtype=np.int64))
     truth = replay_log(
-        load_robot(str(folder / "arm.xml")),
-        told,
-        {"mass:arm": MASS, "kp:hinge": KP},
-        numerics=Numerics("RK4", 0.0025),
+        load_robot(str(folder / "arm.xml")), told, {"mass:arm": MASS, "kp:hinge": KP}, numerics=Numerics("RK4", 0.0025)
     )
     sticky = replay_log(
         load_robot(str(folder / "arm.xml")),
@@ -234,9 +231,7 @@ FITTING = (*BASE, "--fit", "mass:*")
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )
-def test_mistakes_end_in_one_clear_message(
-    cli: Cli, bench: Path, argv: tuple[str, ...], code: int, said: str
-) -> None:
+def test_mistakes_end_in_one_clear_message(cli: Cli, bench: Path, argv: tuple[str, ...], code: int, said: str) -> None:
     names = {
         "arm": bench / "arm.xml",
         "other": bench / "other.xml",
@@ -307,8 +302,7 @@ def test_study_file_gives_every_flag_and_the_command_line_wins(cli: Cli, bench: 
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
-    [("sed = 3", "sed"), ("seed = 'x'", "seed"), ("[[", "not TOML"), ("[bounds]\nkp = 2", "bounds")],
+    ("text", "said"), [("sed = 3", "sed"), ("seed = 'x'", "seed"), ("[[", "not TOML"), ("[bounds]\nkp = 2", "bounds")]
 )
 def test_study_file_mistakes(cli: Cli, tmp_path: Path, text: str, said: str) -> None:
     study = tmp_path / "study.toml"
@@ -424,9 +418,7 @@ def test_report_is_written_again_from_the_result(cli: Cli, asked: tuple[str, ...
     assert "https://" not in page
 
 
-def test_an_internal_error_is_short(
-    cli: Cli, asked: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_internal_error_is_short(cli: Cli, asked: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("no")
 

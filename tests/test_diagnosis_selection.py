@@ -34,28 +34,14 @@ from sysid_btr.diagnosis.selection import (
     verdict_limit,
 )
 from sysid_btr.diagnosis.split import cut_time
-from sysid_btr.diagnosis.trials import (
-    Trial,
-    candidates_of,
-    choose,
-    is_hopeless,
-    is_outdone,
-    is_rival,
-    is_superfluous,
-)
+from sysid_btr.diagnosis.trials import Trial, candidates_of, choose, is_hopeless, is_outdone, is_rival, is_superfluous
 from sysid_btr.diagnosis.verdict import giving_way, verdict_of
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted, paired_t
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.friction import (
-    CoulombFriction,
-    LoadFriction,
-    LoadFrictionLarger,
-    StribeckFriction,
-    ViscousDamping,
-)
+from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionLarger, StribeckFriction, ViscousDamping
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import SensorDelay
 from sysid_btr.terms.servo import CommandDelay
@@ -194,9 +180,7 @@ def test_something_left(first: Numbers, now: Numbers, expected: bool) -> None:
         ([101.0, 101.0], [101.0], [101.0], False, True),
     ],
 )
-def test_has_minimum_gain(
-    first: Numbers, before: Numbers, after: Numbers, transient: bool, expected: bool
-) -> None:
+def test_has_minimum_gain(first: Numbers, before: Numbers, after: Numbers, transient: bool, expected: bool) -> None:
     gains = has_minimum_gain(RULES, fitted(first), fitted(before), fitted(after), transient=transient)
     assert gains is expected
 

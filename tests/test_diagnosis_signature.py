@@ -25,12 +25,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.emps import emps
-from sysid_btr.terms.disturbance import (
-    DriveDisturbanceTrain,
-    ExternalDisturbance,
-    ExternalDisturbanceTrain,
-    pulses,
-)
+from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbance, ExternalDisturbanceTrain, pulses
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.library import select_effects
@@ -184,9 +179,7 @@ def test_pulses_in_the_drive_are_asked_for_only_where_an_effort_could_show_them(
     period=st.floats(0.05, 2.0),
     step=st.sampled_from([0.001, 0.004, 0.01]),
 )
-def test_a_train_gives_the_impulse_of_its_pulses(
-    start: float, duration: float, period: float, step: float
-) -> None:
+def test_a_train_gives_the_impulse_of_its_pulses(start: float, duration: float, period: float, step: float) -> None:
     time = step * np.arange(round(3.0 / step) + 1)
     given_torque = pulses(np.array([[2.0, start, duration, period]]), time)[0]
     begins = start + period * np.arange(200)
@@ -201,9 +194,7 @@ def test_a_train_of_one_pulse_is_a_push() -> None:
     log = toys.swing(toys.LEG_JOINTS)
     scales = dict.fromkeys(toys.LEG_JOINTS, toys.SCALE)
     one = toys.position(toys.leg(), log, (ExternalDisturbance.at(("knee",), scales),), (0.7, 0.4, 0.1))
-    train = toys.position(
-        toys.leg(), log, (ExternalDisturbanceTrain.at(("knee",), scales),), (0.7, 0.4, 0.1, 50.0)
-    )
+    train = toys.position(toys.leg(), log, (ExternalDisturbanceTrain.at(("knee",), scales),), (0.7, 0.4, 0.1, 50.0))
     assert train == pytest.approx(one, abs=1e-12)
 
 
@@ -211,9 +202,7 @@ def test_a_pulse_in_the_drive_moves_like_a_push_and_shows_in_the_effort() -> Non
     log = toys.swing(toys.LEG_JOINTS)
     scales = dict.fromkeys(toys.LEG_JOINTS, toys.SCALE)
     values = (0.5, 0.4, 0.2, 0.6)
-    outside = toys.run(
-        toys.leg(), log, (ExternalDisturbanceTrain.at(("knee",), scales),), values, effort=True
-    )
+    outside = toys.run(toys.leg(), log, (ExternalDisturbanceTrain.at(("knee",), scales),), values, effort=True)
     inside = toys.run(toys.leg(), log, (DriveDisturbanceTrain.at(("knee",), scales),), values, effort=True)
     assert inside.position == pytest.approx(outside.position, abs=1e-9)
     assert inside.effort is not None

@@ -62,13 +62,7 @@ class Careless:
     name: str = "careless"
 
     def fit(
-        self,
-        problem: Problem,
-        *,
-        rng: np.random.Generator,
-        budget: Budget,
-        journal: Journal,
-        progress: Progress,
+        self, problem: Problem, *, rng: np.random.Generator, budget: Budget, journal: Journal, progress: Progress
     ) -> FitResult:
         del budget, journal, progress
         x = problem.start + rng.standard_normal((500, len(problem.start))) * (problem.upper - problem.lower)
@@ -86,17 +80,9 @@ class Tampered:
     name: str = "tampered"
 
     def fit(
-        self,
-        problem: Problem,
-        *,
-        rng: np.random.Generator,
-        budget: Budget,
-        journal: Journal,
-        progress: Progress,
+        self, problem: Problem, *, rng: np.random.Generator, budget: Budget, journal: Journal, progress: Progress
     ) -> FitResult:
-        result = get_estimator("cmaes").fit(
-            problem, rng=rng, budget=budget, journal=journal, progress=progress
-        )
+        result = get_estimator("cmaes").fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
         return self.change(result)
 
 
@@ -128,13 +114,7 @@ class Unseeded:
     name: str = "unseeded"
 
     def fit(
-        self,
-        problem: Problem,
-        *,
-        rng: np.random.Generator,
-        budget: Budget,
-        journal: Journal,
-        progress: Progress,
+        self, problem: Problem, *, rng: np.random.Generator, budget: Budget, journal: Journal, progress: Progress
     ) -> FitResult:
         del rng
         fresh = np.random.default_rng()
@@ -204,11 +184,7 @@ def test_errors_of_the_simulation_pass_through_and_keep_the_journal() -> None:
 def test_time_budget_ends_a_fit() -> None:
     problem, _ = linear_gaussian(np.random.default_rng(1))
     result = get_estimator("ga", patience=10**9).fit(
-        problem,
-        rng=np.random.default_rng(1),
-        budget=Budget(seconds=0.05),
-        journal=Journal(),
-        progress=silent,
+        problem, rng=np.random.default_rng(1), budget=Budget(seconds=0.05), journal=Journal(), progress=silent
     )
     assert result.termination is Termination.BUDGET_SPENT
     assert 0.05 <= result.seconds < 5.0

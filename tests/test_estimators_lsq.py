@@ -164,9 +164,7 @@ def test_scale_of_parameters_does_not_matter() -> None:
     np.testing.assert_allclose(a.x * scale, b.x, rtol=1e-6)
     assert a.jacobian is not None
     assert b.jacobian is not None
-    np.testing.assert_allclose(
-        a.jacobian / scale, b.jacobian, rtol=1e-5, atol=1e-9 * np.abs(b.jacobian).max()
-    )
+    np.testing.assert_allclose(a.jacobian / scale, b.jacobian, rtol=1e-5, atol=1e-9 * np.abs(b.jacobian).max())
 
 
 def test_failing_neighbours_and_steps_are_survived() -> None:

@@ -45,11 +45,7 @@ DECAY = np.array([2.0, 1.3, -0.4])
 
 
 def test_cmaes_finds_minima_from_afar() -> None:
-    for problem, optimum in (
-        (_decay(), DECAY),
-        (rosenbrock(), np.ones(2)),
-        (bound_active(), bound_active().optimum),
-    ):
+    for problem, optimum in ((_decay(), DECAY), (rosenbrock(), np.ones(2)), (bound_active(), bound_active().optimum)):
         result = run(CmaEs(), problem, evaluations=None)
         assert result.converged
         np.testing.assert_allclose(result.x, optimum, atol=1e-3)
@@ -139,11 +135,7 @@ def test_ga_never_loses_its_best_and_does_not_simulate_it_again() -> None:
     assert result.termination is Termination.ITERATION_LIMIT
 
 
-@given(
-    bits=st.integers(1, 20),
-    start=st.floats(0.0, 1.0),
-    genes=st.lists(st.booleans(), min_size=20, max_size=20),
-)
+@given(bits=st.integers(1, 20), start=st.floats(0.0, 1.0), genes=st.lists(st.booleans(), min_size=20, max_size=20))
 def test_genome_decodes_within_bounds_and_start_exactly(bits: int, start: float, genes: list[bool]) -> None:
     lower, upper = np.array([-3.0]), np.array([7.0])
     genome = _Genome(lower, upper, np.clip(lower + start * 10.0, lower, upper), bits)

@@ -216,9 +216,7 @@ def test_an_unseen_parameter_is_not_identifiable_and_says_why() -> None:
     rng = np.random.default_rng(9)
     jacobian = np.column_stack([50 * rng.standard_normal(400), np.zeros(400)])
     parameters = [Parameter(f"mass:{n}", "1", 1.0, 0.3, 3.0, 0.1) for n in "ab"]
-    seen, unseen = estimates(
-        parameters, np.ones(2), jacobian, rng.standard_normal(400), np.arange(400) // 10
-    )
+    seen, unseen = estimates(parameters, np.ones(2), jacobian, rng.standard_normal(400), np.arange(400) // 10)
     assert (seen.identifiable, unseen.identifiable) == ("yes", "no")
     assert seen.reason == ""
     assert unseen.reason
@@ -330,9 +328,7 @@ def test_coloured_jacobian_is_that_of_plain_differences() -> None:
 
 
 def test_joined_limbs_are_not_varied_together() -> None:
-    joined = TWO_LIMBS.replace(
-        "<actuator>", '<equality><joint joint1="left" joint2="right"/></equality><actuator>'
-    )
+    joined = TWO_LIMBS.replace("<actuator>", '<equality><joint joint1="left" joint2="right"/></equality><actuator>')
     robot = toys.robot_from_xml(joined, "joined")
     log = measured(robot, toys.swing(("left", "left_end", "right"), seconds=1.0))
     study = make_study(robot, [log], numerics=QUICK)
@@ -385,9 +381,7 @@ def test_hanging_nao(shared_data: Path) -> None:
     masses = [e for e in found.estimates if e.name.startswith("mass:")]
     assert len(masses) == 8
     wrong = [
-        e
-        for e in masses
-        if e.identifiable != "no" and not covers(e, truth.get(e.name.removeprefix("mass:"), 1.0))
+        e for e in masses if e.identifiable != "no" and not covers(e, truth.get(e.name.removeprefix("mass:"), 1.0))
     ]
     assert not wrong
     assert {e.name for e in masses if e.identifiable == "no"} == {"mass:RHipRoll", "mass:LHipRoll"}

@@ -236,12 +236,8 @@ def test_a_mapping_says_it_all(tmp_path: Path, good: Log) -> None:
     frame = pd.DataFrame({"T": good.time * 1e3})
     for joint in GOOD_JOINTS:
         sign = -1 if joint == "HeadYaw" else 1
-        frame[f"{joint.lower()} soll"] = np.degrees(
-            sign * good.channels[f"command.{joint}"] - 0.02 * (sign < 0)
-        )
-        frame[f"{joint.lower()} ist"] = np.degrees(
-            sign * good.channels[f"position.{joint}"] - 0.02 * (sign < 0)
-        )
+        frame[f"{joint.lower()} soll"] = np.degrees(sign * good.channels[f"command.{joint}"] - 0.02 * (sign < 0))
+        frame[f"{joint.lower()} ist"] = np.degrees(sign * good.channels[f"position.{joint}"] - 0.02 * (sign < 0))
     frame["gx"] = np.degrees(good.channels["imu.gyro_x"])
     frame["I1"] = 1500.0
     frame.loc[7, "headyaw ist"] = -9999
@@ -309,9 +305,7 @@ def test_a_command_in_other_units_keeps_its_unit_and_gets_no_offset(tmp_path: Pa
 
 
 def test_a_sliding_joint_of_the_model_is_in_metres(tmp_path: Path) -> None:
-    frame = pd.DataFrame(
-        {"time": np.arange(100) * 0.01, "x_cmd": 0.1, "x_pos": 0.1, "h_cmd": 0.1, "h_pos": 0.1}
-    )
+    frame = pd.DataFrame({"time": np.arange(100) * 0.01, "x_cmd": 0.1, "x_pos": 0.1, "h_cmd": 0.1, "h_pos": 0.1})
     frame.to_csv(tmp_path / "log.csv", index=False)
     log = import_log([tmp_path / "log.csv"], model=KnownModel("cart", ("x", "h"), sliding=("x",))).log
     assert log.meta.units == {"command.x": "m", "position.x": "m"}
@@ -328,9 +322,7 @@ def test_a_unit_that_does_not_suit_the_models_joint_is_refused(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "us"), (1e9, "ns")])
-def test_a_clock_without_a_unit_is_recognised_and_told(
-    tmp_path: Path, good: Log, factor: float, unit: str
-) -> None:
+def test_a_clock_without_a_unit_is_recognised_and_told(tmp_path: Path, good: Log, factor: float, unit: str) -> None:
     frame = plain_frame(good)
     frame["time"] *= factor
     frame.to_csv(tmp_path / "log.csv", index=False)
@@ -438,20 +430,7 @@ LINES = "time,a_cmd,a_pos\n" + "".join(f"{i / 100},0.1,0.1\n" for i in range(5))
         ('{"time": 1}', "JSON"),
         ("#ROSBAG V2.0\n", "rosbags-convert"),
     ],
-    ids=[
-        "empty",
-        "header",
-        "comment",
-        "short",
-        "long",
-        "word",
-        "clock",
-        "twice",
-        "bare",
-        "zip",
-        "json",
-        "ros1",
-    ],
+    ids=["empty", "header", "comment", "short", "long", "word", "clock", "twice", "bare", "zip", "json", "ros1"],
 )
 def test_a_table_that_cannot_be_read_says_where(tmp_path: Path, content: str, said: str) -> None:
     path = tmp_path / "log.csv"
@@ -505,9 +484,7 @@ def test_a_table_that_cannot_be_guessed_comes_with_a_mapping_to_edit(tmp_path: P
     same(log, good, JOINT_COLUMNS)
 
 
-@given(
-    names=st.lists(st.text(min_size=1).filter(lambda t: t.strip() == t), min_size=2, max_size=6, unique=True)
-)
+@given(names=st.lists(st.text(min_size=1).filter(lambda t: t.strip() == t), min_size=2, max_size=6, unique=True))
 def test_any_names_make_a_mapping_that_is_toml(names: list[str]) -> None:
     import tomllib
 
@@ -546,19 +523,14 @@ def test_mistakes_in_a_mapping_are_told(tmp_path: Path, text: str, said: str) ->
     [
         ({"columns": {"b_pos": "position.a"}}, "did you mean 'a_pos'"),
         ({"channels": {"position": ["{joint}_angle"]}}, "matches no column"),
-        (
-            {"channels": {"position": ["{joint}_pos"]}, "columns": {"a_cmd": "position.a"}},
-            "more than one column",
-        ),
+        ({"channels": {"position": ["{joint}_pos"]}, "columns": {"a_cmd": "position.a"}}, "more than one column"),
         ({"time": {"column": "clock"}}, "clock"),
         ({"joints": {"knee": {"to": "Knee"}}}, "no such name"),
         ({"joints": {"a": {"range": [0, 1]}}, "units": {"command": "range_0_100"}}, None),
         ({"units": {"position": "range_0_100"}}, r"joints\.a\] range"),
     ],
 )
-def test_a_mapping_that_does_not_fit_the_file_is_told(
-    tmp_path: Path, rules: dict[str, Any], said: str | None
-) -> None:
+def test_a_mapping_that_does_not_fit_the_file_is_told(tmp_path: Path, rules: dict[str, Any], said: str | None) -> None:
     (tmp_path / "log.csv").write_text(LINES)
     if said is None:
         assert import_log([tmp_path / "log.csv"], told=told(**rules)).log.channels["command.a"][0] == 0.001
@@ -568,9 +540,7 @@ def test_a_mapping_that_does_not_fit_the_file_is_told(
 
 
 def test_flags_win_over_the_file() -> None:
-    rules = told(
-        units={"position": "mm", "position.a": "cm", "effort": "mNm"}, joints={"a": {"to": "b", "sign": -1}}
-    )
+    rules = told(units={"position": "mm", "position.a": "cm", "effort": "mNm"}, joints={"a": {"to": "b", "sign": -1}})
     merged = with_flags(rules, units=[("position", "deg")], renames=[("a", "c")], meta={"mount": "free"})
     assert merged.units == {"position": "deg", "effort": "mNm"}
     assert (merged.joints["a"].to, merged.joints["a"].sign, merged.meta.mount) == ("c", -1, "free")
@@ -579,9 +549,7 @@ def test_flags_win_over_the_file() -> None:
 # --- findings and what to do about them -------------------------------------------------------------------------
 
 
-def test_degrees_are_found_against_the_models_ranges_with_the_flags_that_help(
-    tmp_path: Path, good: Log
-) -> None:
+def test_degrees_are_found_against_the_models_ranges_with_the_flags_that_help(tmp_path: Path, good: Log) -> None:
     frame = plain_frame(good)
     frame.iloc[:, 1:] = np.degrees(frame.iloc[:, 1:])
     frame.to_csv(tmp_path / "log.csv", index=False)
@@ -632,9 +600,7 @@ def nao_frame(log: Log) -> pd.DataFrame:
     columns[f"{KEY}InertialSensor/AngleX/Sensor/Value"] = log.channels["imu.angle_x"]
     columns[f"{KEY}InertialSensor/GyroscopeX/Sensor/Value"] = log.channels["imu.gyro_x"]
     for axis in "XYZ":
-        columns[f"{KEY}InertialSensor/Accelerometer{axis}/Sensor/Value"] = log.channels[
-            f"imu.acc_{axis.lower()}"
-        ]
+        columns[f"{KEY}InertialSensor/Accelerometer{axis}/Sensor/Value"] = log.channels[f"imu.acc_{axis.lower()}"]
     columns[f"{KEY}LFoot/FSR/FrontLeft/Sensor/Value"] = log.channels["force.LFoot"] / 9.80665
     columns[f"{KEY}LFoot/FSR/TotalWeight/Sensor/Value"] = 1.0
     columns[f"{KEY}LHand/Position/Sensor/Value"] = 0.5
@@ -875,9 +841,7 @@ def test_a_ros2_bag(tmp_path: Path, ros: Ros, good: Log, storage: str, whole: bo
     assert imported.log.meta.sample_period == good.meta.sample_period
 
 
-def test_commands_between_states_show_up_with_the_next_and_this_is_told(
-    tmp_path: Path, ros: Ros, good: Log
-) -> None:
+def test_commands_between_states_show_up_with_the_next_and_this_is_told(tmp_path: Path, ros: Ros, good: Log) -> None:
     path = write_bag(ros, tmp_path / "bag", conversation(ros, good, early=0.004))
     imported = import_log([path], told=told(**ORDER))
     same(imported.log, good, JOINT_COLUMNS)
@@ -893,9 +857,7 @@ def test_arrays_without_names_ask_for_their_order(tmp_path: Path, ros: Ros, good
         import_log([path], told=told(ros={"joints": ["a", "b"]}))
 
 
-def test_joint_states_may_be_commands_and_an_imu_has_its_own_clock(
-    tmp_path: Path, ros: Ros, good: Log
-) -> None:
+def test_joint_states_may_be_commands_and_an_imu_has_its_own_clock(tmp_path: Path, ros: Ros, good: Log) -> None:
     half = math.sin(0.15), math.cos(0.15)
     sent = []
     for i, t in enumerate(good.time):
@@ -991,11 +953,7 @@ def test_clocks_that_are_not_the_same_are_not_mixed(tmp_path: Path, ros: Ros, go
     for one in conversation(ros, good):
         if one.topic == "/joint_states":
             simulated = one.message.header.stamp
-            stamp = ros(
-                "builtin_interfaces/msg/Time",
-                sec=simulated.sec - 1_700_000_000 + 5,
-                nanosec=simulated.nanosec,
-            )
+            stamp = ros("builtin_interfaces/msg/Time", sec=simulated.sec - 1_700_000_000 + 5, nanosec=simulated.nanosec)
             one = replace(one, message=replace(one.message, header=replace(one.message.header, stamp=stamp)))
         sent.append(one)
     imported = import_log([write_bag(ros, tmp_path / "bag", sent)], told=told(**ORDER))
@@ -1006,11 +964,7 @@ def test_clocks_that_are_not_the_same_are_not_mixed(tmp_path: Path, ros: Ros, go
 Make = Callable[[Ros, list[Sent]], list[Sent]]
 UNUSABLE: dict[str, tuple[Make, dict[str, Any], str]] = {
     "no commands": (lambda _, sent: [s for s in sent if "states" in s.topic], {}, "no topic with commands"),
-    "no states": (
-        lambda _, sent: [s for s in sent if "command" in s.topic],
-        {},
-        "no topic with joint states",
-    ),
+    "no states": (lambda _, sent: [s for s in sent if "command" in s.topic], {}, "no topic with joint states"),
     "twice": (
         lambda _, sent: [*sent, *(replace(s, topic="/other") for s in sent if "states" in s.topic)],
         {},
@@ -1018,11 +972,7 @@ UNUSABLE: dict[str, tuple[Make, dict[str, Any], str]] = {
     ),
     "no stamps": (lambda _, sent: sent, {"clock": "header"}, "no header stamps on /leg/commands"),
     "absent": (lambda _, sent: sent, {"state": "/nowhere"}, "not a topic of the bag"),
-    "wrong": (
-        lambda _, sent: sent,
-        {"command": ["/joint_states"], "state": ["/leg/commands"]},
-        "cannot be used there",
-    ),
+    "wrong": (lambda _, sent: sent, {"command": ["/joint_states"], "state": ["/leg/commands"]}, "cannot be used there"),
     "empty": (
         lambda ros, sent: [
             replace(s, message=ros.joint_state(None, ["a"], [])) if "states" in s.topic else s for s in sent
@@ -1053,9 +1003,7 @@ def test_a_clock_that_jumps_back_is_no_recording(tmp_path: Path, ros: Ros, good:
 
 @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
 @pytest.mark.parametrize("cut", [0.3, 0.9])
-def test_a_bag_that_was_cut_short_is_one_message(
-    tmp_path: Path, ros: Ros, good: Log, storage: str, cut: float
-) -> None:
+def test_a_bag_that_was_cut_short_is_one_message(tmp_path: Path, ros: Ros, good: Log, storage: str, cut: float) -> None:
     folder = write_bag(ros, tmp_path / "bag", conversation(ros, good), storage)
     [file] = [p for p in folder.iterdir() if p.suffix in (".db3", ".mcap")]
     file.write_bytes(file.read_bytes()[: int(cut * file.stat().st_size)])
@@ -1073,17 +1021,10 @@ def test_a_bag_that_was_not_closed_says_what_to_do(tmp_path: Path, ros: Ros, goo
 
 
 @pytest.mark.parametrize(
-    ("module", "storage", "whole"),
-    [("rosbags", "SQLITE3", True), ("mcap", "MCAP", False), ("rosbags", "MCAP", False)],
+    ("module", "storage", "whole"), [("rosbags", "SQLITE3", True), ("mcap", "MCAP", False), ("rosbags", "MCAP", False)]
 )
 def test_a_missing_package_is_named_with_its_extra(
-    tmp_path: Path,
-    ros: Ros,
-    good: Log,
-    monkeypatch: pytest.MonkeyPatch,
-    module: str,
-    storage: str,
-    whole: bool,
+    tmp_path: Path, ros: Ros, good: Log, monkeypatch: pytest.MonkeyPatch, module: str, storage: str, whole: bool
 ) -> None:
     folder = write_bag(ros, tmp_path / "bag", conversation(ros, good)[:20], storage)
     path = folder if whole else next(folder.glob("*.mcap"))
@@ -1156,10 +1097,9 @@ def write_lerobot(
         n = rows.stop - rows.start
         columns = {
             feature: pa.array(
-                [
-                    scale * np.array([log.channels[f"{channel}.{j}"][i] for j in GOOD_JOINTS])
-                    for i in range(len(log))
-                ][rows],
+                [scale * np.array([log.channels[f"{channel}.{j}"][i] for j in GOOD_JOINTS]) for i in range(len(log))][
+                    rows
+                ],
                 type=pa.list_(pa.float32(), len(GOOD_JOINTS)),
             )
             for feature, channel in (("action", "command"), ("observation.state", "position"))
@@ -1179,9 +1119,7 @@ def write_lerobot(
 LEROBOT_NAMES = [f"{j}.pos" for j in GOOD_JOINTS]
 
 
-@pytest.mark.parametrize(
-    ("names", "version"), [(LEROBOT_NAMES, "v3.0"), ({"motors": list(GOOD_JOINTS)}, "v2.1")]
-)
+@pytest.mark.parametrize(("names", "version"), [(LEROBOT_NAMES, "v3.0"), ({"motors": list(GOOD_JOINTS)}, "v2.1")])
 def test_a_lerobot_dataset(tmp_path: Path, good: Log, names: Any, version: str) -> None:
     folder = write_lerobot(tmp_path / "set", good, names=names, version=version)
     imported = import_log([folder], model=MODEL)
@@ -1248,18 +1186,13 @@ def test_lerobot_entries_without_names(tmp_path: Path, good: Log) -> None:
     [
         (lambda f: (f / "meta" / "info.json").write_text("{"), "info.json"),
         (lambda f: (f / "meta" / "info.json").write_text("{}"), "needs `fps`"),
-        (
-            lambda f: (f / "meta" / "info.json").write_text('{"fps": 30, "features": {"action": {}}}'),
-            "no feature obs",
-        ),
+        (lambda f: (f / "meta" / "info.json").write_text('{"fps": 30, "features": {"action": {}}}'), "no feature obs"),
         (lambda f: [p.unlink() for p in f.rglob("*.parquet")], "no Parquet file"),
         (lambda f: next(f.rglob("*.parquet")).write_bytes(b"PAR1cut"), "footer"),
     ],
     ids=["json", "empty", "features", "data", "cut"],
 )
-def test_a_broken_dataset_is_told(
-    tmp_path: Path, good: Log, break_: Callable[[Path], Any], said: str
-) -> None:
+def test_a_broken_dataset_is_told(tmp_path: Path, good: Log, break_: Callable[[Path], Any], said: str) -> None:
     folder = write_lerobot(tmp_path / "set", good, names=LEROBOT_NAMES)
     break_(folder)
     with pytest.raises(LogError, match=said):
@@ -1298,9 +1231,7 @@ def test_one_that_cannot_be_loaded_is_told(monkeypatch: pytest.MonkeyPatch) -> N
     from importlib.metadata import EntryPoint
 
     entry = EntryPoint("diary", "nowhere_at_all:Diary", ENTRY_POINTS)
-    monkeypatch.setattr(
-        "importlib.metadata.entry_points", lambda *, group: [entry] if group == ENTRY_POINTS else []
-    )
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda *, group: [entry] if group == ENTRY_POINTS else [])
     with pytest.raises(UsageError, match="nowhere_at_all"):
         get_importer("diary")
 

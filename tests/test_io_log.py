@@ -145,9 +145,7 @@ def test_existing_files_are_not_overwritten(good_log: Log, tmp_path: Path) -> No
     assert [p.name for p in tmp_path.iterdir()] == ["a.parquet"]
 
 
-def test_a_failed_write_leaves_what_was_there(
-    good_log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_leaves_what_was_there(good_log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.parquet"
     path.write_text("precious")
 

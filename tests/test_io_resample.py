@@ -13,9 +13,7 @@ from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io import Log, LogMeta, command_at, holdout_split, read_log, resample
 
 
-def small_log(
-    time: np.ndarray, command: np.ndarray, position: np.ndarray, hold: str = "zoh", **more: object
-) -> Log:
+def small_log(time: np.ndarray, command: np.ndarray, position: np.ndarray, hold: str = "zoh", **more: object) -> Log:
     n = len(time)
     return Log(
         time=np.asarray(time, dtype=np.float64),
@@ -65,9 +63,7 @@ def test_commands_are_held_and_sensors_interpolated(log: Log, period: float) -> 
     assume(away_from_the_tolerance(log, period))
     out = resample(log, period)
     snap = 0.01 * np.median(np.diff(log.time))
-    for t, command, position in zip(
-        out.time, out.channels["command.a"], out.channels["position.a"], strict=True
-    ):
+    for t, command, position in zip(out.time, out.channels["command.a"], out.channels["position.a"], strict=True):
         held = int(np.sum(log.time <= t + snap)) - 1
         assert command == log.channels["command.a"][held]
         expected = np.interp(t, log.time, log.channels["position.a"])
@@ -138,9 +134,7 @@ def test_nothing_crosses_episodes() -> None:
         out = resample(log, 0.005)
         np.testing.assert_array_equal(out.episode, [0] * 5 + [1] * 5)
         np.testing.assert_allclose(out.time[5:], 5.0 + shift + np.arange(5) * 0.005)
-        np.testing.assert_allclose(
-            out.channels["position.a"], [0, 0.5, 1, 1.5, 2, 100, 100.5, 101, 101.5, 102]
-        )
+        np.testing.assert_allclose(out.channels["position.a"], [0, 0.5, 1, 1.5, 2, 100, 100.5, 101, 101.5, 102])
 
 
 def test_linear_commands_and_set_channels() -> None:
@@ -174,9 +168,7 @@ def test_a_clock_that_goes_back_is_refused(good_log: Log) -> None:
 
 
 def test_command_at_holds_fills_and_extends() -> None:
-    log = small_log(
-        1000 + np.array([0.0, 0.01, 0.02, 0.03]), np.array([np.nan, 1.0, np.nan, 3.0]), np.zeros(4)
-    )
+    log = small_log(1000 + np.array([0.0, 0.01, 0.02, 0.03]), np.array([np.nan, 1.0, np.nan, 3.0]), np.zeros(4))
     times = 1000 + np.array([-5.0, 0.0, 0.005, 0.0149, 0.025, 0.03, 9.0])
     np.testing.assert_array_equal(command_at(log, ["a"], times)[:, 0], [1, 1, 1, 1, 1, 3, 3])
     shuffled = times[::-1]

@@ -59,9 +59,7 @@ def rename(log: Log, **columns: str) -> Log:
 def write_raw(path: Path, columns: dict[str, object], meta: object = META) -> Path:
     table = pa.table(columns)
     if meta is not None:
-        table = table.replace_schema_metadata(
-            {"sysid_btr": meta if isinstance(meta, bytes) else json.dumps(meta)}
-        )
+        table = table.replace_schema_metadata({"sysid_btr": meta if isinstance(meta, bytes) else json.dumps(meta)})
     pq.write_table(table, path)
     return path
 
@@ -88,14 +86,8 @@ def test_any_origin_and_an_uneven_clock_are_fine(good_log: Log, check) -> None:
 
 def test_episodes_may_restart_or_jump_the_clock(good_log: Log, check) -> None:
     episode = np.repeat([0, 1], 400)
-    assert (
-        check(replace(good_log, episode=episode, time=np.where(episode, good_log.time - 4, good_log.time)))
-        == ()
-    )
-    assert (
-        check(replace(good_log, episode=episode, time=np.where(episode, good_log.time + 60, good_log.time)))
-        == ()
-    )
+    assert check(replace(good_log, episode=episode, time=np.where(episode, good_log.time - 4, good_log.time))) == ()
+    assert check(replace(good_log, episode=episode, time=np.where(episode, good_log.time + 60, good_log.time))) == ()
 
 
 def test_unknown_columns_are_no_problem(good_log: Log, check) -> None:
@@ -116,9 +108,7 @@ def test_recorded_logs_fit_their_model(shared_data: Path) -> None:
 
     for folder, model in (("nao_gantry", "nominal.xml"), ("nao_walk", "nominal_free.xml")):
         loaded = mujoco.MjModel.from_xml_path(str(shared_data / folder / model))
-        hinges = [
-            loaded.joint(i) for i in range(loaded.njnt) if loaded.jnt_type[i] != mujoco.mjtJoint.mjJNT_FREE
-        ]
+        hinges = [loaded.joint(i) for i in range(loaded.njnt) if loaded.jnt_type[i] != mujoco.mjtJoint.mjJNT_FREE]
         ranges = {j.name: (float(j.range[0]), float(j.range[1])) for j in hinges if loaded.jnt_limited[j.id]}
         for path in sorted((shared_data / folder).glob("*.parquet")):
             assert validate_file(path, joints=[j.name for j in hinges], ranges=ranges) == (), path
@@ -412,9 +402,7 @@ def test_time_nan(good_log: Log, check) -> None:
     assert "samples 50-52" in problem.where
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
-)
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
 def test_time_in_another_unit(good_log: Log, check, factor: float, unit: str) -> None:
     problem = next(p for p in check(replace(good_log, time=good_log.time * factor)) if p.code == "time.unit")
     assert problem.severity == "error"
@@ -439,9 +427,7 @@ def test_jitter(good_log: Log, check) -> None:
     bursts = good_log.time.copy()
     bursts[1::2] -= 0.009
     problem = only(
-        [p for p in check(replace(good_log, time=bursts)) if p.code != "time.period"],
-        "time.jitter",
-        "warning",
+        [p for p in check(replace(good_log, time=bursts)) if p.code != "time.period"], "time.jitter", "warning"
     )
     assert "uneven" in problem.message
 
@@ -480,9 +466,7 @@ def test_mostly_nan(good_log: Log, check) -> None:
 
 def test_all_nan(good_log: Log, check) -> None:
     empty = np.full(len(good_log), np.nan)
-    problem = only(
-        check(change(good_log, position__HeadYaw=empty, position__LHipRoll=empty)), "values.all_missing"
-    )
+    problem = only(check(change(good_log, position__HeadYaw=empty, position__LHipRoll=empty)), "values.all_missing")
     assert problem.where == "position of HeadYaw, LHipRoll"
 
 
@@ -510,19 +494,13 @@ def test_dead_position_while_its_command_moves(good_log: Log, check) -> None:
 
 def test_dead_joint_with_a_dead_command_is_fine(good_log: Log, check) -> None:
     still = np.zeros(len(good_log))
-    assert (
-        check(change(good_log, position__HeadYaw=still, command__HeadYaw=still, velocity__HeadYaw=still))
-        == ()
-    )
+    assert check(change(good_log, position__HeadYaw=still, command__HeadYaw=still, velocity__HeadYaw=still)) == ()
 
 
 def test_a_servo_switched_off_may_stay(good_log: Log, check) -> None:
     n = len(good_log)
     log = change(
-        good_log,
-        position__HeadYaw=np.full(n, 0.1),
-        velocity__HeadYaw=np.zeros(n),
-        enabled__HeadYaw=np.zeros(n),
+        good_log, position__HeadYaw=np.full(n, 0.1), velocity__HeadYaw=np.zeros(n), enabled__HeadYaw=np.zeros(n)
     )
     assert check(log) == ()
 
@@ -538,9 +516,7 @@ def test_position_stuck_for_a_while(good_log: Log, check, start: int, stop: int)
 def test_position_saturated(good_log: Log, check) -> None:
     position = np.clip(good_log.channels["position.HeadYaw"], -0.1, 0.1)
     problem = only(
-        check(change(good_log, position__HeadYaw=position, velocity__HeadYaw=None)),
-        "position.saturated",
-        "warning",
+        check(change(good_log, position__HeadYaw=position, velocity__HeadYaw=None)), "position.saturated", "warning"
     )
     assert "HeadYaw" in problem.where
 
@@ -559,9 +535,7 @@ def test_dead_sensors(good_log: Log, check) -> None:
 
 
 def test_dead_command_while_the_position_moves(good_log: Log, check) -> None:
-    problem = only(
-        check(change(good_log, command__HeadYaw=np.zeros(len(good_log)))), "command.dead", "warning"
-    )
+    problem = only(check(change(good_log, command__HeadYaw=np.zeros(len(good_log)))), "command.dead", "warning")
     assert problem.where == "command.HeadYaw"
 
 
@@ -600,9 +574,7 @@ def test_swaps_in_a_recorded_log(shared_data: Path, check) -> None:
         channels = dict(log.channels)
         a, b = "position.LKneePitch", "position.RKneePitch"
         channels[a], channels[b] = channels[b], channels[a]
-        assert (
-            only(check(replace(log, channels=channels)), "joint.swapped").where == "LKneePitch and RKneePitch"
-        )
+        assert only(check(replace(log, channels=channels)), "joint.swapped").where == "LKneePitch and RKneePitch"
 
 
 def test_wrong_sign(good_log: Log, check) -> None:
@@ -643,10 +615,7 @@ def test_an_ordinary_lag_is_no_problem(good_log: Log, check) -> None:
     for lag in (0.0, 0.05, 0.1, 0.2):
         position = chirp(np.maximum(good_log.time - lag, 0))
         log = change(
-            good_log,
-            command__HeadYaw=chirp(good_log.time),
-            position__HeadYaw=position,
-            velocity__HeadYaw=None,
+            good_log, command__HeadYaw=chirp(good_log.time), position__HeadYaw=position, velocity__HeadYaw=None
         )
         assert check(log) == (), lag
 
@@ -688,9 +657,7 @@ def test_a_joint_that_really_turns(good_log: Log, check) -> None:
 
 
 def test_millimetres(good_log: Log, check) -> None:
-    log = change(
-        good_log, position__HeadYaw=1000 * good_log.channels["position.HeadYaw"], velocity__HeadYaw=None
-    )
+    log = change(good_log, position__HeadYaw=1000 * good_log.channels["position.HeadYaw"], velocity__HeadYaw=None)
     units = {"command.HeadYaw": "m", "position.HeadYaw": "m"}
     problem = only(check(replace(log, meta=replace(log.meta, units=units))), "units.millimetres")
     assert problem.where == "position.HeadYaw"
@@ -743,9 +710,7 @@ def test_all_faults_in_one_pass(good_log: Log, tmp_path: Path) -> None:
     del columns["velocity.LHipRoll"]
     columns["postion.LKneePitch"] = columns.pop("position.LKneePitch")
     columns["position.RKneePitch"] = np.full(len(time), np.nan)
-    path = write_raw(
-        tmp_path / "a.parquet", columns, {**META, "schema": 3, "mount": "wheels", "units": {"duty": "%"}}
-    )
+    path = write_raw(tmp_path / "a.parquet", columns, {**META, "schema": 3, "mount": "wheels", "units": {"duty": "%"}})
     problems = validate_file(path, joints=[*JOINTS, "Tail"])
     assert {p.code for p in problems if p.severity == "error"} == {
         "meta.schema",

@@ -267,9 +267,7 @@ def test_the_drive_of_emps_saturates_at_ten_volts() -> None:
 
 def pendulum_log(seconds: float = 1.0, **channels: Any) -> Log:
     time = np.arange(round(seconds / 0.005) + 1) * 0.005
-    columns = {"command.pendulum": np.zeros(len(time))} | {
-        k.replace("_", "."): v for k, v in channels.items()
-    }
+    columns = {"command.pendulum": np.zeros(len(time))} | {k.replace("_", "."): v for k, v in channels.items()}
     filled = {k: np.broadcast_to(np.asarray(v, dtype=float), time.shape).copy() for k, v in columns.items()}
     return make_log(time, filled, extra={"servo": {"kp_register": 400}})
 
@@ -327,8 +325,7 @@ def test_the_duty_saturates_at_the_supply() -> None:
 
 
 @pytest.mark.parametrize(
-    "extra",
-    [{"servo": {"kp_register": "high"}}, {"pendulum": {"mass": -1.0}}, {"servo": 400}, {"supply_nominal": 0}],
+    "extra", [{"servo": {"kp_register": "high"}}, {"pendulum": {"mass": -1.0}}, {"servo": 400}, {"supply_nominal": 0}]
 )
 def test_metadata_that_cannot_be_used_is_told(extra: dict[str, object]) -> None:
     log = make_log(np.arange(10) * 0.01, {"command.pendulum": np.zeros(10)}, extra=extra)

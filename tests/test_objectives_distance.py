@@ -57,9 +57,7 @@ def test_information_distance_does_not_see_a_relabelling() -> None:
 def target(values: np.ndarray) -> Target:
     n = len(values)
     floor = (NoiseFloor(1e-3, "high-frequency", 0.0),)
-    return Target(
-        "position", ("a",), np.array([0]), values[:, None], floor, np.array([1e-3]), np.ones((n, 1), bool)
-    )
+    return Target("position", ("a",), np.array([0]), values[:, None], floor, np.array([1e-3]), np.ones((n, 1), bool))
 
 
 def test_phi2_grows_with_lag_and_leaves_out_joints_that_stand_still() -> None:

@@ -20,14 +20,7 @@ from sysid_btr.posterior.likelihood import Likelihood, make_likelihood, settle
 from sysid_btr.posterior.priors import LogNormal, Normal, Prior, Uniform
 from sysid_btr.posterior.sampling import Sample, Settings, assess, sample
 from sysid_btr.posterior.surrogate import Foretold
-from sysid_btr.testing import (
-    Killed,
-    ToyProblem,
-    Witness,
-    bound_active,
-    failing_region,
-    linear_gaussian,
-)
+from sysid_btr.testing import Killed, ToyProblem, Witness, bound_active, failing_region, linear_gaussian
 
 
 def plain(toy: ToyProblem, x: FloatArray) -> Likelihood:

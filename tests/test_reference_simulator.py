@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pin = pytest.importorskip(
-    "pinocchio", reason="the recorder needs Pinocchio (pip install pin)", exc_type=ImportError
-)
+pin = pytest.importorskip("pinocchio", reason="the recorder needs Pinocchio (pip install pin)", exc_type=ImportError)
 
 from reference_simulator import (  # noqa: E402
     EFFECTS,
@@ -188,20 +186,14 @@ Balance = Callable[[float, float], float]
 
 BALANCES: dict[str, Balance] = {
     "armature:inertia=0.01": lambda u, q: KP * (u - q) - WEIGHT * np.sin(q),
-    "payload:mass=0.3,offset=0/0/-0.15": lambda u, q: (
-        KP * (u - q) - (WEIGHT + 0.3 * GRAVITY * 0.15) * np.sin(q)
-    ),
-    "com_offset:offset=0.03/0/0": lambda u, q: (
-        KP * (u - q) + GRAVITY * (MASS * 0.03 * np.cos(q) - MOMENT * np.sin(q))
-    ),
+    "payload:mass=0.3,offset=0/0/-0.15": lambda u, q: KP * (u - q) - (WEIGHT + 0.3 * GRAVITY * 0.15) * np.sin(q),
+    "com_offset:offset=0.03/0/0": lambda u, q: KP * (u - q) + GRAVITY * (MASS * 0.03 * np.cos(q) - MOMENT * np.sin(q)),
     "constant_force:torque=0.25": lambda u, q: KP * (u - q) - WEIGHT * np.sin(q) + 0.25,
     "joint_spring:stiffness=3,rest=-0.2": lambda u, q: KP * (u - q) - WEIGHT * np.sin(q) - 3.0 * (q + 0.2),
     "cogging:amplitude=0.1,periods=9,phase=0.4": lambda u, q: (
         KP * (u - q) - WEIGHT * np.sin(q) + 0.1 * np.sin(9.0 * q + 0.4)
     ),
-    "external_disturbance:torque=0.4,start=0.5,duration=9": lambda u, q: (
-        KP * (u - q) - WEIGHT * np.sin(q) + 0.4
-    ),
+    "external_disturbance:torque=0.4,start=0.5,duration=9": lambda u, q: KP * (u - q) - WEIGHT * np.sin(q) + 0.4,
     "gravity_tilt:pitch=0.1": lambda u, q: KP * (u - q) - WEIGHT * np.sin(q + 0.1),
     "integral_gain:ki=40,limit=5": lambda u, q: u - q,
     "integral_gain:ki=40,limit=0.2": lambda u, q: KP * (u - q) - WEIGHT * np.sin(q) + 0.2,
@@ -310,11 +302,7 @@ def test_a_delay_is_an_exact_shift(delay: float) -> None:
 def test_armature_adds_to_the_inertia() -> None:
     inertia = KP * 0.1 * 0.5 * 0.001**2 / position(hold(0.1, seconds=0.01, rate=1000.0))[2]
     more = (
-        KP
-        * 0.1
-        * 0.5
-        * 0.001**2
-        / position(planted(hold(0.1, seconds=0.01, rate=1000.0), "armature:inertia=0.02"))[2]
+        KP * 0.1 * 0.5 * 0.001**2 / position(planted(hold(0.1, seconds=0.01, rate=1000.0), "armature:inertia=0.02"))[2]
     )
     assert more - inertia == pytest.approx(0.02, rel=0.02)
 
@@ -410,9 +398,7 @@ def test_noise_floor_is_that_of_a_gantry_encoder() -> None:
 
 def test_imu_of_a_tilted_base_agrees_with_its_accelerometer() -> None:
     sensors = Sensors(imu=True)
-    exact = exact_channels(
-        planted(hold(0.0, seconds=0.1, sensors=sensors), "gravity_tilt:roll=0.1,pitch=0.2")
-    )[1]
+    exact = exact_channels(planted(hold(0.0, seconds=0.1, sensors=sensors), "gravity_tilt:roll=0.1,pitch=0.2"))[1]
     acc = [exact[f"imu.acc_{axis}"][0] for axis in "xyz"]
     assert np.linalg.norm(acc) == pytest.approx(GRAVITY)
     assert exact["imu.angle_x"][0] == pytest.approx(0.1)
@@ -441,9 +427,7 @@ def test_an_effect_does_not_change_the_motion_or_the_noise() -> None:
     logs = [record(spec)[0].channels for spec in specs]
     exact = [exact_channels(spec)[1] for spec in specs]
     assert np.array_equal(logs[0]["command.pendulum"], logs[1]["command.pendulum"])
-    noise = [
-        log["position.pendulum"] - ideal["position.pendulum"] for log, ideal in zip(logs, exact, strict=True)
-    ]
+    noise = [log["position.pendulum"] - ideal["position.pendulum"] for log, ideal in zip(logs, exact, strict=True)]
     np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
 
 
@@ -465,12 +449,7 @@ def test_sample_logs_are_what_their_generator_makes(name: str) -> None:
 def test_command_line_writes_log_and_truth(tmp_path: Path) -> None:
     out = tmp_path / "leg.parquet"
     words = "--robot six_joint_leg --seconds 0.5 --seed 3 --mass KneePitch=1.2 --kp 0.9 --kv *Hip*=1.1"
-    effects = [
-        "--effect",
-        "coulomb_friction:Knee*,AnkleRoll:torque=0.3",
-        "--effect",
-        "gravity_tilt:pitch=0.02",
-    ]
+    effects = ["--effect", "coulomb_friction:Knee*,AnkleRoll:torque=0.3", "--effect", "gravity_tilt:pitch=0.02"]
     assert main([*words.split(), *effects, "--log", "effort", "--out", str(out)]) == 0
     truth = json.loads((tmp_path / "leg.truth.json").read_text())
     assert truth["mass"]["KneePitch"] == {"scale": 1.2, "value": pytest.approx(1.2 * 0.42)}

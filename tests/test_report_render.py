@@ -18,14 +18,7 @@ from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.report import render
-from sysid_btr.report.render import (
-    PANEL,
-    CannotRenderError,
-    backends,
-    draw,
-    save_pictures,
-    scene_of,
-)
+from sysid_btr.report.render import PANEL, CannotRenderError, backends, draw, save_pictures, scene_of
 from sysid_btr.run_folder import Folder
 
 SAMPLES = sample_logs()

@@ -169,9 +169,7 @@ def test_finite_numbers_survive_bit_for_bit(values: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "{", "[1]", '{"schema": "sysid_btr.result/2"}', "{}"],
-    ids=["empty", "cut", "list", "2", "none"],
+    "text", ["", "{", "[1]", '{"schema": "sysid_btr.result/2"}', "{}"], ids=["empty", "cut", "list", "2", "none"]
 )
 def test_what_is_no_result_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "result.json").write_text(text)
@@ -207,13 +205,7 @@ def test_tables_name_effect_interval_and_reason(study: Study, capsys: pytest.Cap
 
     show(closing(study, verdict="ambiguous").to_dict(), console(sys.stdout))
     text = capsys.readouterr().out
-    for part in (
-        "dry friction at <hinge>",
-        "not identifiable",
-        "hardly any sensor",
-        "0.280 .. 0.320",
-        "mrad",
-    ):
+    for part in ("dry friction at <hinge>", "not identifiable", "hardly any sensor", "0.280 .. 0.320", "mrad"):
         assert part in text
 
 

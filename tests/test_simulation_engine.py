@@ -88,9 +88,7 @@ def test_a_step_that_divides_the_period_puts_samples_on_borders() -> None:
     grid = make_grid(swing(seconds=3.0), ARM, ZERO, 0.005)
     assert not grid.fraction.any()
     np.testing.assert_array_equal(grid.state, 2 * np.arange(301))
-    np.testing.assert_allclose(
-        grid.command[:, 0], np.repeat(swing(seconds=3.0).channels["command.arm"][:-1], 2)
-    )
+    np.testing.assert_allclose(grid.command[:, 0], np.repeat(swing(seconds=3.0).channels["command.arm"][:-1], 2))
 
 
 def test_a_linear_command_is_interpolated() -> None:
@@ -115,10 +113,7 @@ def irregular(log: Log, seed: int = 0, keep: float = 0.6) -> tuple[Log, np.ndarr
     rows = np.union1d(rows, [0, len(log) - 1])
     return (
         replace(
-            log,
-            time=log.time[rows],
-            channels={k: v[rows] for k, v in log.channels.items()},
-            episode=log.episode[rows],
+            log, time=log.time[rows], channels={k: v[rows] for k, v in log.channels.items()}, episode=log.episode[rows]
         ),
         rows,
     )
@@ -134,8 +129,7 @@ def test_samples_between_steps_are_read_out_to_third_order() -> None:
     log = held(0.4, seconds=1.0, period=0.0071)
     exact = position(pendulum(), log, numerics=Numerics("RK4", 0.0071 / 8))
     errors = [
-        np.abs(position(pendulum(), log, numerics=Numerics("RK4", step)) - exact).max()
-        for step in (0.008, 0.004)
+        np.abs(position(pendulum(), log, numerics=Numerics("RK4", step)) - exact).max() for step in (0.008, 0.004)
     ]
     assert errors[0] < 1e-4
     assert errors[1] < errors[0] / 6
@@ -267,9 +261,7 @@ def test_the_step_is_chosen_by_its_effect_on_the_log() -> None:
     q = position(pendulum(), log, numerics=Numerics("RK4", 0.0005))[:, 0]
     for noise, coarse in ((1e-3, True), (1e-8, False)):
         seen = q + np.random.default_rng(0).normal(scale=noise, size=len(q))
-        numerics, change = choose_numerics(
-            pendulum(), replace(log, channels={**log.channels, "position.arm": seen})
-        )
+        numerics, change = choose_numerics(pendulum(), replace(log, channels={**log.channels, "position.arm": seen}))
         assert change < 0.02
         assert (numerics.timestep >= 0.005) is coarse
         assert 0.01 / numerics.timestep == pytest.approx(round(0.01 / numerics.timestep))
@@ -336,9 +328,7 @@ def test_the_start_comes_from_the_first_samples() -> None:
     rng = np.random.default_rng(0)
     time = np.arange(60) * 0.01
     noisy = 0.3 + 0.5 * time + rng.normal(scale=1e-3, size=60)
-    qpos, qvel = initial_state(
-        make_log(time, {"position.arm": noisy}), ("arm", "other"), np.array([0.0, 0.4])
-    )
+    qpos, qvel = initial_state(make_log(time, {"position.arm": noisy}), ("arm", "other"), np.array([0.0, 0.4]))
     np.testing.assert_allclose(qpos, [0.3, 0.4], atol=2e-3)
     np.testing.assert_allclose(qvel, [0.5, 0.0], atol=0.05)
 
@@ -489,10 +479,7 @@ def test_logs_simulated_together_move_as_each_does_alone(law: bool) -> None:
     robots = [leg(), with_spec(leg(), _stiffer(1.5)), leg(), leg()]
     effect = StribeckFriction(("knee",)) if law else CoulombFriction(("knee",))
     terms = (*parse_parameters(["mass:knee", "delay:hip"], leg()), effect)
-    replays = [
-        Replay(r, log, terms, Numerics("RK4", 0.0025), effort=True)
-        for r, log in zip(robots, logs, strict=True)
-    ]
+    replays = [Replay(r, log, terms, Numerics("RK4", 0.0025), effort=True) for r, log in zip(robots, logs, strict=True)]
     found = group_replays(replays)
     assert sorted(i for party in found for i in party) == [0, 1, 2, 3]
     assert max(len(party) for party in found) == 3, "the short one is not dragged along"

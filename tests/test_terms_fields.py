@@ -57,11 +57,7 @@ CASES: dict[str, tuple[str, list[float], Callable[[Any], None]]] = {
     "mass": ("mass:knee", [1.3], lambda s: scale_mass(s, 1.3)),
     "com": ("com:knee", [0.01, -0.02, 0.03], lambda s: shift_com(s, (0.01, -0.02, 0.03))),
     "damping": ("damping:knee", [0.31], lambda s: set_joint(s, "damping", [0.31, 0, 0])),
-    "quadratic_damping": (
-        "quadratic_damping:knee",
-        [0.04],
-        lambda s: set_joint(s, "damping", [0.05, 0.04, 0]),
-    ),
+    "quadratic_damping": ("quadratic_damping:knee", [0.04], lambda s: set_joint(s, "damping", [0.05, 0.04, 0])),
     "frictionloss": ("frictionloss:knee", [0.2], lambda s: set_joint(s, "frictionloss", 0.2)),
     "armature": ("armature:knee", [0.02], lambda s: set_joint(s, "armature", 0.02)),
     "stiffness": ("stiffness:knee", [1.7], lambda s: set_joint(s, "stiffness", [1.7, 0, 0])),
@@ -94,12 +90,7 @@ def test_mass_takes_the_inertia_along_and_inertia_leaves_the_mass() -> None:
 
 @pytest.mark.parametrize(
     ("field", "place", "value"),
-    [
-        ("damping", "knee", 0.05),
-        ("armature", "hip", 0.006),
-        ("stiffness", "ankle", 0.1),
-        ("frictionloss", "knee", 0),
-    ],
+    [("damping", "knee", 0.05), ("armature", "hip", 0.006), ("stiffness", "ankle", 0.1), ("frictionloss", "knee", 0)],
 )
 def test_absolute_fields_start_from_the_model(field: str, place: str, value: float) -> None:
     assert parse_parameters([f"{field}:{place}"], leg())[0].parameters[0].nominal == pytest.approx(value)

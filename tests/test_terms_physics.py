@@ -229,9 +229,7 @@ def test_a_payload_is_a_body_that_is_fixed_to_the_link(own: float) -> None:
 
 
 def test_a_payload_hangs_at_its_lever() -> None:
-    q = solve(
-        lambda q: KP * (COMMAND - q) - gravity(q) - 0.2 * GRAVITY * (0.15 * np.sin(q) - 0.05 * np.cos(q))
-    )
+    q = solve(lambda q: KP * (COMMAND - q) - gravity(q) - 0.2 * GRAVITY * (0.15 * np.sin(q) - 0.05 * np.cos(q)))
     assert rest(Payload, [0.2, 0.05, 0.0, -0.15, 0.0], seconds=6.0) == pytest.approx(q, abs=1e-8)
 
 
@@ -283,9 +281,7 @@ def test_quadratic_damping_decays_a_free_rotor_as_one_over_time() -> None:
 def test_stribeck_friction_without_its_static_part_is_dry_friction() -> None:
     log = swing()
     stribeck = position(pendulum(), log, [at_arm(StribeckFriction)], [0.2, 0.0, 0.4])
-    np.testing.assert_allclose(
-        stribeck, position(pendulum(), log, [at_arm(CoulombFriction)], [0.2]), atol=1e-12
-    )
+    np.testing.assert_allclose(stribeck, position(pendulum(), log, [at_arm(CoulombFriction)], [0.2]), atol=1e-12)
 
 
 def test_stribeck_friction_is_larger_at_rest_than_in_motion() -> None:
@@ -305,9 +301,7 @@ def test_load_friction_holds_what_the_load_presses() -> None:
     servo = KP * (COMMAND - q)
     assert abs(servo - gravity(q)) <= 0.3 * abs(servo) * 1.001
     assert abs(servo - gravity(q)) > 0.02, "stuck away from the frictionless rest"
-    assert rest(LoadFriction, [0.0]) == pytest.approx(
-        solve(lambda q: KP * (COMMAND - q) - gravity(q)), abs=1e-9
-    )
+    assert rest(LoadFriction, [0.0]) == pytest.approx(solve(lambda q: KP * (COMMAND - q) - gravity(q)), abs=1e-9)
 
 
 def test_friction_of_the_larger_load_holds_more_where_the_weight_is_the_larger() -> None:
@@ -351,16 +345,12 @@ def test_back_emf_damps_a_driven_joint_as_friction_does_and_a_released_one_not()
     np.testing.assert_allclose(position(pendulum(), log, [at_arm(BackEmf)], [0.05]), damped, atol=2e-4)
     assert np.abs(damped - position(pendulum(), log)).max() > 1e-2
     released = make_log(log.time, {**log.channels, "enabled.arm": np.zeros(len(log.time))})
-    np.testing.assert_array_equal(
-        position(pendulum(), released, [at_arm(BackEmf)], [0.05]), position(pendulum(), log)
-    )
+    np.testing.assert_array_equal(position(pendulum(), released, [at_arm(BackEmf)], [0.05]), position(pendulum(), log))
 
 
 def test_back_emf_moves_the_limits_of_the_torque_with_the_speed() -> None:
     """At full drive a motor stops accelerating at its no-load speed."""
-    limited = robot_from_xml(
-        PENDULUM.replace(f'kv="{KV}"', 'kv="0" forcerange="-.3 .3"').replace(f"-{GRAVITY}", "0")
-    )
+    limited = robot_from_xml(PENDULUM.replace(f'kv="{KV}"', 'kv="0" forcerange="-.3 .3"').replace(f"-{GRAVITY}", "0"))
     outputs = run(limited, held(1e3, 6.0), [at_arm(BackEmf)], [0.1], Numerics("RK4", 0.001))
     damping = 0.1 + float(limited.compile().dof_damping[0])
     assert outputs.velocity[0, -1, 0] == pytest.approx(0.3 / damping, rel=1e-3)
@@ -381,9 +371,7 @@ def test_a_torque_limit_is_a_plateau() -> None:
 def test_a_torque_limit_never_widens_the_models_own() -> None:
     limited = robot_from_xml(PENDULUM.replace(f'kv="{KV}"', f'kv="{KV}" forcerange="-.3 .3"'))
     log = held(2.0)
-    np.testing.assert_array_equal(
-        position(limited, log, [at_arm(TorqueLimit)], [0.4]), position(limited, log)
-    )
+    np.testing.assert_array_equal(position(limited, log, [at_arm(TorqueLimit)], [0.4]), position(limited, log))
 
 
 def test_torque_falls_with_speed_and_is_gone_at_the_no_load_speed() -> None:
@@ -401,9 +389,7 @@ def test_a_speed_torque_limit_does_not_limit_braking() -> None:
     robot = with_spec(pendulum(), lambda s: setattr(s.option, "gravity", [0, 0, 0]))
     log = held(-50.0, 0.1)
     start = parse_parameters(["qvel0:arm"], robot)
-    outputs = run(
-        robot, log, [*start, at_arm(SpeedTorqueLimit)], [3.0, 0.5, 4.0], Numerics("RK4", 0.001), effort=True
-    )
+    outputs = run(robot, log, [*start, at_arm(SpeedTorqueLimit)], [3.0, 0.5, 4.0], Numerics("RK4", 0.001), effort=True)
     assert outputs.effort is not None
     assert outputs.effort[0, 0, 0] == pytest.approx(-0.5)
 
@@ -456,9 +442,7 @@ def test_heat_weakens_the_servo_until_it_gives_off_what_it_takes() -> None:
 
 @pytest.mark.parametrize("effect", [Backlash, BacklashMotor])
 @pytest.mark.parametrize("command", [0.6, -0.6])
-def test_play_lets_the_link_fall_to_the_side_where_gravity_pulls(
-    effect: type[Effect], command: float
-) -> None:
+def test_play_lets_the_link_fall_to_the_side_where_gravity_pulls(effect: type[Effect], command: float) -> None:
     play, side = 0.06, np.sign(command)
     q = solve(lambda q: KP * (command - (q + side * play / 2)) - gravity(q))
     assert rest(effect, [play, 0.0], command) == pytest.approx(q, abs=1e-3)
@@ -582,9 +566,7 @@ def test_several_effects_at_once_agree_with_an_independent_integration() -> None
     seen = position(pendulum(), log, [at_arm(e) for e in effects], values, Numerics("RK4", 0.0025))
     state, wanted = [0.0, 0.0], [0.0]
     for k in range(len(log.time) - 1):
-        middle = solve_ivp(
-            lambda t, s, k=k: rate(log.time[k] + 0.005, s), (0, 0.01), state, rtol=1e-9, atol=1e-11
-        )
+        middle = solve_ivp(lambda t, s, k=k: rate(log.time[k] + 0.005, s), (0, 0.01), state, rtol=1e-9, atol=1e-11)
         state = [float(middle.y[0, -1]), float(middle.y[1, -1])]
         wanted.append(state[0])
     np.testing.assert_allclose(seen[:, 0], wanted, atol=2e-5)

@@ -65,12 +65,7 @@ LEG = """
 """
 
 SCALE = JointScale(
-    torque_rms=0.8,
-    torque_peak=2.5,
-    velocity_rms=2.0,
-    velocity_peak=6.0,
-    acceleration_rms=30.0,
-    span=1.0,
+    torque_rms=0.8, torque_peak=2.5, velocity_rms=2.0, velocity_peak=6.0, acceleration_rms=30.0, span=1.0
 )
 """Roughly what the toys do in `swing`."""
 
@@ -120,15 +115,12 @@ def held(value: float = 0.0, seconds: float = 2.0, period: float = 0.01, joint: 
     return make_log(time, {f"command.{joint}": np.full(len(time), value)}, sample_period=period)
 
 
-def swing(
-    joints: Sequence[str] = ("arm",), seconds: float = 2.0, period: float = 0.01, size: float = 0.5
-) -> Log:
+def swing(joints: Sequence[str] = ("arm",), seconds: float = 2.0, period: float = 0.01, size: float = 0.5) -> Log:
     """Smooth commands that start at rest and then move every joint differently."""
     time = np.arange(round(seconds / period) + 1) * period
     fade = 1 - np.exp(-((time / 0.3) ** 2))
     channels = {
-        f"command.{j}": size * fade * np.sin(2 * np.pi * (0.9 + 0.3 * i) * time + 0.5 * i)
-        for i, j in enumerate(joints)
+        f"command.{j}": size * fade * np.sin(2 * np.pi * (0.9 + 0.3 * i) * time + 0.5 * i) for i, j in enumerate(joints)
     }
     return make_log(time, channels, sample_period=period)
 
@@ -137,12 +129,7 @@ LEG_JOINTS = ("hip", "knee", "ankle")
 
 
 def run(
-    robot: Robot,
-    log: Log,
-    terms: Sequence[Term] = (),
-    values: Any = None,
-    numerics: Numerics = FINE,
-    **options: Any,
+    robot: Robot, log: Log, terms: Sequence[Term] = (), values: Any = None, numerics: Numerics = FINE, **options: Any
 ) -> Outputs:
     """Predicted sensors under one candidate (numbers) or several (rows)."""
     replay = Replay(robot, log, tuple(terms), numerics, **options)

@@ -31,9 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     if options.list:
         for case in _chosen(options):
-            print(
-                f"{case.id:<12}{case.bench.name:<4} {case.spec.motion:<10}{_planted(case.spec.effects) or 'nothing'}"
-            )
+            print(f"{case.id:<12}{case.bench.name:<4} {case.spec.motion:<10}{_planted(case.spec.effects) or 'nothing'}")
         return 0
     if not options.summary:
         _run(options)
@@ -47,9 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--part", choices=(*PARTS, "all"), default="all")
     parser.add_argument("--only", metavar="N,N", help="numbers within the part, from 1; a-b for a range")
     parser.add_argument("--count", type=int, metavar="N", help="stop after N logs")
-    parser.add_argument(
-        "--seconds-budget", type=float, metavar="S", help="start no further log after S seconds"
-    )
+    parser.add_argument("--seconds-budget", type=float, metavar="S", help="start no further log after S seconds")
     parser.add_argument(
         "--series", type=int, default=0, help="another draw of everything, for logs that nobody has tuned on"
     )

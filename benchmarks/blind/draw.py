@@ -176,9 +176,7 @@ def _clean(rng: Generator, bench: Bench, number: int) -> Recording:
     """Other motions, sensors and numerics; the servo of one in five is digital, as its metadata says."""
     motion = list(MOTIONS)[(number - 1) % len(MOTIONS)]
     noise = float(rng.uniform(1.0e-4, 8.0e-4))
-    sensors = Sensors(
-        bits=int(rng.choice([0, 12, 12, 14])), position_noise=noise, effort=bool(rng.random() < 0.25)
-    )
+    sensors = Sensors(bits=int(rng.choice([0, 12, 12, 14])), position_noise=noise, effort=bool(rng.random() < 0.25))
     spec = _plain(rng, bench, motion, sensors)
     step = float(rng.choice([2.5e-4, 5.0e-4, 1.0e-3]))
     return replace(spec, step=step, servo_period=2.0e-3 if number % 5 == 4 else None)
@@ -274,9 +272,7 @@ class View:
             for k, effect in enumerate(effects):
                 others = effects[:k] + effects[k + 1 :]
                 without = (
-                    _table(replace(self.plain, effects=others, step=ROUGH), self.columns)
-                    if others
-                    else self.exact
+                    _table(replace(self.plain, effects=others, step=ROUGH), self.columns) if others else self.exact
                 )
                 if not self._shows(effect, whole - without):
                     return False

@@ -108,9 +108,7 @@ def judge(
     names = named_effects(result["effects"])
     inside = all(e.in_library for e in effects)
     if not effects or not inside:
-        outcome, why = _nothing_to_name(
-            result["verdict"], names, expected="" if not effects else effects[0].name
-        )
+        outcome, why = _nothing_to_name(result["verdict"], names, expected="" if not effects else effects[0].name)
         return Judgement(outcome, why, math.nan, 0, 0)
     true = planted_names(effects)
     outcome, why, matched = _match(result["verdict"], names, true, context)
@@ -143,14 +141,9 @@ def named_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Named, ...]:
 
 def _nothing_to_name(verdict: str, names: tuple[Named, ...], expected: str) -> tuple[Outcome, str]:
     if names:
-        return (
-            "wrong",
-            f"named {', '.join(sorted(n.effect for n in names))} where the library has nothing to name",
-        )
+        return ("wrong", f"named {', '.join(sorted(n.effect for n in names))} where the library has nothing to name")
     if not expected:
-        return (
-            ("yes", "") if verdict == "nothing_missing" else ("unexplained", "a residual that is not there")
-        )
+        return ("yes", "") if verdict == "nothing_missing" else ("unexplained", "a residual that is not there")
     return ("yes", "") if verdict == "unexplained" else ("missed", f"{expected} went unseen")
 
 
@@ -161,9 +154,7 @@ def _match(
         return "missed", "nothing seen", ()
     if not names:
         return "unexplained", "", ()
-    right = {
-        e: next((n for n in names if n.effect == e.name and same_place(e, n.where)), None) for e in effects
-    }
+    right = {e: next((n for n in names if n.effect == e.name and same_place(e, n.where)), None) for e in effects}
     found = tuple(e for e in effects if right[e])
     under = {e: right[e] or _under_another_name(e, names, context) for e in effects}
     extra = [n for n in names if n not in under.values()]
@@ -236,11 +227,7 @@ TRUE: dict[str, Callable[[Any], dict[str, float]]] = {
     "coulomb_friction": lambda e: {"torque": e.torque},
     "viscous_damping": lambda e: {"b": e.coefficient},
     "quadratic_damping": lambda e: {"b": e.coefficient},
-    "stribeck_friction": lambda e: {
-        "static": e.static - e.coulomb,
-        "coulomb": e.coulomb,
-        "velocity": e.velocity,
-    },
+    "stribeck_friction": lambda e: {"static": e.static - e.coulomb, "coulomb": e.coulomb, "velocity": e.velocity},
     "load_friction": lambda e: {"ratio": e.coefficient},
     "armature": lambda e: {"inertia": e.inertia},
     "command_delay": lambda e: {"time": e.delay},

@@ -81,9 +81,7 @@ def either_sign(rng: Generator, low: float, high: float) -> float:
 def _stribeck(rng: Generator, stage: Stage, where: Names) -> Effect:
     coulomb = rng.uniform(0.05, 0.2)
     static = coulomb + rng.uniform(0.1, 0.3)
-    return planted.StribeckFriction(
-        where=where, coulomb=coulomb, static=static, velocity=rng.uniform(0.1, 0.6)
-    )
+    return planted.StribeckFriction(where=where, coulomb=coulomb, static=static, velocity=rng.uniform(0.1, 0.6))
 
 
 def _speed_torque(rng: Generator, stage: Stage, where: Names) -> Effect:
@@ -152,33 +150,23 @@ LIBRARY: dict[str, Recipe] = {
         effort=True,
     ),
     "quadratic_damping": Recipe(
-        lambda r, s, w: planted.QuadraticDamping(where=w, coefficient=log_uniform(r, 0.02, 0.12)),
-        SHARP,
+        lambda r, s, w: planted.QuadraticDamping(where=w, coefficient=log_uniform(r, 0.02, 0.12)), SHARP
     ),
     "stribeck_friction": Recipe(_stribeck, ("triangles", "poses", "multisine")),
     "load_friction": Recipe(
-        lambda r, s, w: planted.LoadFriction(where=w, coefficient=r.uniform(0.1, 0.35)),
-        SMOOTH,
-        everywhere=True,
+        lambda r, s, w: planted.LoadFriction(where=w, coefficient=r.uniform(0.1, 0.35)), SMOOTH, everywhere=True
     ),
     "armature": Recipe(
-        lambda r, s, w: planted.Armature(where=w, inertia=log_uniform(r, 0.004, 0.02)),
-        SHARP,
-        everywhere=True,
+        lambda r, s, w: planted.Armature(where=w, inertia=log_uniform(r, 0.004, 0.02)), SHARP, everywhere=True
     ),
     "command_delay": Recipe(
         lambda r, s, w: planted.CommandDelay(where=w, delay=r.uniform(0.01, 0.04)), TIMED, everywhere=True
     ),
     "sensor_delay": Recipe(
-        lambda r, s, w: planted.SensorDelay(where=w, delay=r.uniform(0.008, 0.03)),
-        TIMED,
-        everywhere=True,
-        effort=True,
+        lambda r, s, w: planted.SensorDelay(where=w, delay=r.uniform(0.008, 0.03)), TIMED, everywhere=True, effort=True
     ),
     "backlash": Recipe(
-        lambda r, s, w: planted.Backlash(
-            where=w, play=r.uniform(0.01, 0.05), motor_damping=float(r.integers(2))
-        ),
+        lambda r, s, w: planted.Backlash(where=w, play=r.uniform(0.01, 0.05), motor_damping=float(r.integers(2))),
         ("triangles", "multisine", "poses", "gait"),
     ),
     "joint_compliance": Recipe(
@@ -188,9 +176,7 @@ LIBRARY: dict[str, Recipe] = {
         SHARP,
     ),
     "joint_spring": Recipe(
-        lambda r, s, w: planted.JointSpring(
-            where=w, stiffness=log_uniform(r, 0.5, 4.0), rest=r.uniform(-0.5, 0.5)
-        ),
+        lambda r, s, w: planted.JointSpring(where=w, stiffness=log_uniform(r, 0.5, 4.0), rest=r.uniform(-0.5, 0.5)),
         ("multisine", "poses"),
     ),
     "encoder_offset": Recipe(
@@ -203,8 +189,7 @@ LIBRARY: dict[str, Recipe] = {
         ("multisine", "poses", "steps"),
     ),
     "torque_limit": Recipe(
-        lambda r, s, w: planted.TorqueLimit(where=w, limit=r.uniform(0.4, 0.75) * s.least(s.torque_peak, w)),
-        SHARP,
+        lambda r, s, w: planted.TorqueLimit(where=w, limit=r.uniform(0.4, 0.75) * s.least(s.torque_peak, w)), SHARP
     ),
     "speed_torque_limit": Recipe(_speed_torque, SHARP),
     "slew_limit": Recipe(
@@ -232,9 +217,7 @@ LIBRARY: dict[str, Recipe] = {
     ),
     "external_disturbance": Recipe(_push, SMOOTH),
     "gravity_tilt": Recipe(
-        lambda r, s, w: planted.GravityTilt(
-            roll=either_sign(r, 0.02, 0.08), pitch=either_sign(r, 0.02, 0.08)
-        ),
+        lambda r, s, w: planted.GravityTilt(roll=either_sign(r, 0.02, 0.08), pitch=either_sign(r, 0.02, 0.08)),
         SMOOTH,
         scope="robot",
     ),
@@ -258,9 +241,7 @@ OUTSIDE: dict[str, Recipe] = {
         scope="two",
     ),
     "random_walk_torque": Recipe(
-        lambda r, s, w: planted.RandomWalkTorque(
-            where=w, size=r.uniform(0.15, 0.4), correlation=r.uniform(0.5, 2.0)
-        ),
+        lambda r, s, w: planted.RandomWalkTorque(where=w, size=r.uniform(0.15, 0.4), correlation=r.uniform(0.5, 2.0)),
         SMOOTH,
     ),
 }

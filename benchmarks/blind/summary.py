@@ -26,9 +26,7 @@ def summarise(rows: Sequence[Row]) -> str:
     if not rows:
         return "no rows"
     lines = [f"code {', '.join(dict.fromkeys(r.code for r in rows))}", ""]
-    lines.append(
-        f"{'part':<9}{'logs':>5}" + "".join(f"{o:>12}" for o in OUTCOMES) + f"{'mean s':>9}{'max s':>7}"
-    )
+    lines.append(f"{'part':<9}{'logs':>5}" + "".join(f"{o:>12}" for o in OUTCOMES) + f"{'mean s':>9}{'max s':>7}")
     for part in PARTS:
         own = [r for r in rows if r.part == part]
         if not own:
@@ -99,9 +97,7 @@ def _confusion(rows: Sequence[Row]) -> list[str]:
     own = [r for r in rows if r.part in ("single", "outside")]
     if not own:
         return []
-    cells = Counter(
-        (_names(r.planted)[0], " + ".join(_names(r.named)) or r.verdict or r.correct) for r in own
-    )
+    cells = Counter((_names(r.planted)[0], " + ".join(_names(r.named)) or r.verdict or r.correct) for r in own)
     lines = ["planted -> named"]
     for effect in dict.fromkeys(_names(r.planted)[0] for r in own):
         found = ", ".join(f"{n} {c}" for (p, n), c in cells.most_common() if p == effect)

@@ -69,9 +69,7 @@ def read_rows(path: Path) -> list[Row]:
         reader = csv.DictReader(file)
         expected = [f.name for f in fields(Row)]
         if reader.fieldnames != expected:
-            raise ValueError(
-                f"{path} has other columns than {', '.join(expected)}; move it away or give --out"
-            )
+            raise ValueError(f"{path} has other columns than {', '.join(expected)}; move it away or give --out")
         return [Row(**{k: NUMBERS.get(k, str)(v) for k, v in line.items()}) for line in reader]  # type: ignore[arg-type]
 
 

@@ -137,9 +137,7 @@ class FolderExchange:
         return Log(
             time=self.task.time,
             channels={f"command.{joint}": commands[:, i] for i, joint in enumerate(self.space.joints)},
-            meta=LogMeta(
-                robot=self.robot, mount="free", sample_period=self.task.period, source=MOTION
-            ),
+            meta=LogMeta(robot=self.robot, mount="free", sample_period=self.task.period, source=MOTION),
             episode=np.zeros(len(self.task.time), dtype=np.int64),
         )
 

@@ -41,9 +41,7 @@ class World(Replay):
         model = self.model
         free = free_joints(model)
         if len(free) != 1:
-            raise ModelError(
-                f"model {self.robot.name}: {len(free)} free joints; a walking robot has one, at its base"
-            )
+            raise ModelError(f"model {self.robot.name}: {len(free)} free joints; a walking robot has one, at its base")
         joint = int(free[0])
         return replace(make_index(model), base=(int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])))
 
@@ -108,9 +106,7 @@ class World(Replay):
         state = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl}
         data = evaluate(batch, state, ("sensordata",), threads=self.threads)["sensordata"]
         first = model.sensor_adr
-        return {
-            model.sensor(s).name: data[:, first[s] : first[s] + model.sensor_dim[s]] for s in range(model.nsensor)
-        }
+        return {model.sensor(s).name: data[:, first[s] : first[s] + model.sensor_dim[s]] for s in range(model.nsensor)}
 
 
 def lowest(batch: BatchModel, state: Fields, threads: int = 0) -> FloatArray:
@@ -145,9 +141,7 @@ def _reach(kind: int, size: FloatArray, up: FloatArray) -> FloatArray:
     return np.asarray(np.sum(size * np.abs(up), axis=1))  # boxes, and others by their box
 
 
-def make_world(
-    robot: Robot, task: Walk, terms: Sequence[Term] = (), *, halvings: int = 0, threads: int = 0
-) -> World:
+def make_world(robot: Robot, task: Walk, terms: Sequence[Term] = (), *, halvings: int = 0, threads: int = 0) -> World:
     """The world of a robot and a task.
 
     Parameters

@@ -9,14 +9,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.cli.fitting import fingerprint
-from sysid_btr.cli.groups import (
-    JsonOptions,
-    ModelOptions,
-    OutOptions,
-    ParameterOptions,
-    SeedOptions,
-    ThreadOptions,
-)
+from sysid_btr.cli.groups import JsonOptions, ModelOptions, OutOptions, ParameterOptions, SeedOptions, ThreadOptions
 from sysid_btr.cli.inputs import check_freed, find_robot
 from sysid_btr.cli.kinds import Numbers
 from sysid_btr.cli.options import option
@@ -53,10 +46,7 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     robot_set: Numbers = option(
-        {},
-        "Change that simulation, e.g. 'mass:*=1.1'.",
-        metavar="PARAMETERS=VALUE",
-        decides=True,
+        {}, "Change that simulation, e.g. 'mass:*=1.1'.", metavar="PARAMETERS=VALUE", decides=True
     )
     exchange: Path | None = option(
         None,
@@ -86,10 +76,7 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     choice: str = option(
-        "fittest",
-        "How trials are chosen: fittest, or disagreement (among models).",
-        metavar="NAME",
-        decides=True,
+        "fittest", "How trials are chosen: fittest, or disagreement (among models).", metavar="NAME", decides=True
     )
     search: str = option(
         "ga", "How controllers are searched for: ga (the paper) or cmaes.", metavar="NAME", decides=True

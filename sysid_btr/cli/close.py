@@ -28,12 +28,7 @@ DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
 class CloseOptions(FittingOptions):
     """Options of `close`."""
 
-    effects: Names = option(
-        ("all",),
-        "Effects that may be named.",
-        metavar="all|NAME[,NAME..]",
-        decides=True,
-    )
+    effects: Names = option(("all",), "Effects that may be named.", metavar="all|NAME[,NAME..]", decides=True)
 
 
 def close(options: CloseOptions) -> int:

@@ -180,8 +180,7 @@ for _verb in VERBS:
 @app.callback()
 def _root(
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_print_versions, is_eager=True, help="Print versions and exit."),
+        bool, typer.Option("--version", callback=_print_versions, is_eager=True, help="Print versions and exit.")
     ] = False,
 ) -> None:
     pass

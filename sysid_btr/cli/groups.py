@@ -16,12 +16,7 @@ class ModelOptions(Options):
     """The model."""
 
     model: str | None = option(
-        None,
-        "Built-in robot, or an MJCF or URDF file.",
-        short="-m",
-        metavar="NAME|FILE",
-        beside=True,
-        decides=True,
+        None, "Built-in robot, or an MJCF or URDF file.", short="-m", metavar="NAME|FILE", beside=True, decides=True
     )
 
 
@@ -44,10 +39,7 @@ class ParameterOptions(Options):
         decides=True,
     )
     bounds: Ranges = option(
-        {},
-        "Bounds of a parameter or of a whole field, e.g. kp=0.5:2.",
-        metavar="NAME=LOW:HIGH",
-        decides=True,
+        {}, "Bounds of a parameter or of a whole field, e.g. kp=0.5:2.", metavar="NAME=LOW:HIGH", decides=True
     )
 
 
@@ -89,10 +81,7 @@ class SearchOptions(Options):
     """How the best values are searched for."""
 
     start: Numbers = option(
-        {},
-        "Initial value of a parameter, by name or glob, e.g. mass:slider=0.7.",
-        metavar="NAME=VALUE",
-        decides=True,
+        {}, "Initial value of a parameter, by name or glob, e.g. mass:slider=0.7.", metavar="NAME=VALUE", decides=True
     )
     estimator: str = option(
         "lsq",
@@ -178,22 +167,13 @@ class RenderOptions(RunOptions):
     """What is kept of a run that changes a model."""
 
     render: bool = option(
-        False,
-        "Also draw log, model before and model after, side by side: render.png and render.gif.",
-        decides=False,
+        False, "Also draw log, model before and model after, side by side: render.png and render.gif.", decides=False
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class FittingOptions(
-    StudyOptions,
-    SimulatorOptions,
-    SeedOptions,
-    ThreadOptions,
-    ExecutorOptions,
-    OutOptions,
-    RenderOptions,
-    JsonOptions,
+    StudyOptions, SimulatorOptions, SeedOptions, ThreadOptions, ExecutorOptions, OutOptions, RenderOptions, JsonOptions
 ):
     """What `fit`, `posterior` and `close` have in common."""
 

@@ -43,11 +43,7 @@ class ImportOptions(ModelOptions):
         None, "Whether the torso was fixed or free to move.", metavar="fixed|free", decides=False
     )
     out: Path | None = option(
-        None,
-        "Log to write (Parquet); without it nothing is written.",
-        short="-o",
-        metavar="FILE",
-        decides=False,
+        None, "Log to write (Parquet); without it nothing is written.", short="-o", metavar="FILE", decides=False
     )
     overwrite: bool = option(False, "Replace the file at --out.", decides=False)
     force: bool = option(False, "Write the log although the validation finds errors, to repair it.", decides=False)
@@ -68,10 +64,7 @@ def import_(options: ImportOptions) -> int:
     target = output_file(options.out, options.files, options.overwrite)
     known = known_model(options.model)
     told = with_flags(
-        read_map(options.map),
-        units=options.unit.items(),
-        renames=options.rename.items(),
-        meta={"mount": options.mount},
+        read_map(options.map), units=options.unit.items(), renames=options.rename.items(), meta={"mount": options.mount}
     )
     try:
         imported = import_log(options.files, importer=options.format, told=told, model=known)

@@ -111,9 +111,7 @@ def _what_can_be_freed(robot: Robot) -> str:
     fields: dict[str, list[str]] = {}
     for name, cls in declarable(robot.fields).items():
         fields.setdefault(cls(places=(), declared=name).location, []).append(name)
-    lines = [
-        f"no parameters to fit: give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has",
-    ]
+    lines = [f"no parameters to fit: give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has"]
     for scope, names in (
         ("body", body_names(robot)),
         ("joint", joint_names(robot)),

@@ -187,11 +187,7 @@ KINDS: dict[Any, Kind] = {
         table=True,
     ),
     Holdout: Kind(
-        list[str],
-        "a fraction, a file or a list of files",
-        lambda v: _is_number(v) or _is_list(v),
-        _list,
-        _holdout,
+        list[str], "a fraction, a file or a list of files", lambda v: _is_number(v) or _is_list(v), _list, _holdout
     ),
 }
 """By the type of an option."""

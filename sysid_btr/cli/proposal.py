@@ -86,9 +86,7 @@ def study_file(robot: Robot, logs: Sequence[Log], model: str, out: Path | None =
             f"no joint of {robot.name} has a position in the log. Positions: {there}. Joints of the model: "
             f"{', '.join(joint_names(robot))}. Import the log again with --rename, or give its robot's model"
         )
-    moving = [
-        name for name in joint_names(robot) if any(s.moves for one in seen for s in one if s.name == name)
-    ]
+    moving = [name for name in joint_names(robot) if any(s.moves for one in seen for s in one if s.name == name)]
     folder = None if out is None else out.parent
     lines = [
         f"# Study of {', '.join(map(_file, logs))} with the model {robot.name}, proposed by `sysid-btr init`.",
@@ -245,10 +243,7 @@ def _masses(model: mujoco.MjModel, moving: Sequence[str], free: bool) -> Iterato
 def _gains(model: mujoco.MjModel, moving: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Gains of the servos of joints that moved, as one factor each."""
     servos = {model.joint(int(model.actuator_trnid[a, 0])).name: a for a in servo_actuators(model)}
-    for field, column, what in (
-        ("kp", 1, "stiffness of the servos"),
-        ("kv", 2, "damping of the servos"),
-    ):
+    for field, column, what in (("kp", 1, "stiffness of the servos"), ("kv", 2, "damping of the servos")):
         own = [n for n, a in servos.items() if n in moving and model.actuator_biasprm[a, column] != 0]
         if not own:
             continue

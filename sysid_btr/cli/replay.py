@@ -10,14 +10,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sysid_btr.cli.groups import (
-    JsonOptions,
-    LogOptions,
-    ModelOptions,
-    ParamsOptions,
-    SimulatorOptions,
-    ThreadOptions,
-)
+from sysid_btr.cli.groups import JsonOptions, LogOptions, ModelOptions, ParamsOptions, SimulatorOptions, ThreadOptions
 from sysid_btr.cli.inputs import find_robot, read_logs
 from sysid_btr.cli.kinds import Numbers
 from sysid_btr.cli.options import option
@@ -35,12 +28,7 @@ if TYPE_CHECKING:
 class ReplayOptions(ModelOptions, LogOptions, ParamsOptions, SimulatorOptions, ThreadOptions, JsonOptions):
     """Options of `replay`."""
 
-    set: Numbers = option(
-        {},
-        "Change the model first, e.g. 'kp:*=0.9'.",
-        metavar="PARAMETERS=VALUE",
-        decides=False,
-    )
+    set: Numbers = option({}, "Change the model first, e.g. 'kp:*=0.9'.", metavar="PARAMETERS=VALUE", decides=False)
     out: Path | None = option(None, "Folder for the predicted logs.", short="-o", metavar="DIR", decides=False)
     overwrite: bool = option(False, "Replace earlier results in --out.", decides=False)
 
@@ -101,13 +89,7 @@ def _compare(
 
     threads = options.threads
     study = make_study(
-        robot,
-        logs,
-        holdout=logs,
-        channels=COMPARED,
-        numerics=numerics,
-        simulator=options.simulator,
-        threads=threads,
+        robot, logs, holdout=logs, channels=COMPARED, numerics=numerics, simulator=options.simulator, threads=threads
     )
     scores = score_problem(study.train_problem(model), model.values)
     for path, one in zip(targets, logs, strict=False):

@@ -53,11 +53,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             for t in trials
             # what others leave unexplained at some moment looks like a push
             if has_minimum_gain(
-                rules,
-                state.before,
-                now,
-                t.fitted,
-                transient=t.hypothesis.effect.transient and bool(state.effects),
+                rules, state.before, now, t.fitted, transient=t.hypothesis.effect.transient and bool(state.effects)
             )
         ]
         winner = choose(rules, now, worthy)
@@ -171,7 +167,5 @@ def _perturbations(
     present = {(type(t), p) for t in terms if t.numbers == t.kinds for p in t.places}
     split = {p for t in terms if t.structural for p in t.places}
     return [
-        q
-        for q in asked
-        if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
+        q for q in asked if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
     ]

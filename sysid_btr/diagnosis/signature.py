@@ -19,11 +19,7 @@ from sysid_btr.diagnosis.signal_features import Line, Train, hats, predicted_sha
 from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.terms.disturbance import (
-    DriveDisturbanceTrain,
-    ExternalDisturbance,
-    ExternalDisturbanceTrain,
-)
+from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbance, ExternalDisturbanceTrain
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.transmission import Cogging
@@ -61,11 +57,7 @@ DESCRIBED = 3
 
 
 def proposals(
-    study: Study,
-    problem: ReplayProblem,
-    values: FloatArray,
-    residual: FloatArray,
-    library: Sequence[type[Effect]],
+    study: Study, problem: ReplayProblem, values: FloatArray, residual: FloatArray, library: Sequence[type[Effect]]
 ) -> list[Perturbation]:
     """Perturbations at effects whose place in time or angle only the residual shows.
 
@@ -151,9 +143,7 @@ def spatial_lines(one: MissingTorque) -> list[Line]:
     motion = _of_motion(one, 1)[rows]
 
     def shares(at: FloatArray) -> FloatArray:
-        pairs = [
-            one.seen(np.column_stack([np.sin(n * one.position), np.cos(n * one.position)]))[rows] for n in at
-        ]
+        pairs = [one.seen(np.column_stack([np.sin(n * one.position), np.cos(n * one.position)]))[rows] for n in at]
         return signal_features.line_shares(one.torque[rows], pairs, motion)
 
     found = shares(numbers)
@@ -369,9 +359,7 @@ def _features(
     yield _Feature("acceleration", "the acceleration", of(one.acceleration, 6))
     yield _Feature("command_rate", "the rate of the command", of(np.gradient(one.command, one.period), 7))
     patch = hats(q, np.linspace(q.min(), q.max(), 14))
-    yield _Feature(
-        "position_and_direction", "the position and the direction of motion", sign[:, None] * patch
-    )
+    yield _Feature("position_and_direction", "the position and the direction of motion", sign[:, None] * patch)
     for other in torques:
         if other.episode == one.episode and other.joint != one.joint:
             own = np.column_stack([_unit(q), of(other.position, 5)])

@@ -234,9 +234,7 @@ def _pulsed(
 
 def _servo_as_measured(states: dict[str, FloatArray], period: float) -> FloatArray:
     """Torque of the servo in the state that was measured, by the law that it follows in the replay."""
-    law = np.column_stack(
-        [np.ones(len(states["servo"])), states["command"], states["predicted"], states["velocity"]]
-    )
+    law = np.column_stack([np.ones(len(states["servo"])), states["command"], states["predicted"], states["velocity"]])
     weights = np.linalg.lstsq(law, states["servo"], rcond=1e-10)[0]
     error = states["position"] - states["predicted"]
     smooth = np.convolve(np.pad(error, 2, mode="edge"), np.full(5, 0.2), mode="valid")

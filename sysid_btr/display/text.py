@@ -68,10 +68,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield Text(f"+ {effect['sentence'] or effect['effect']}")
         if effect["confused_with"]:
             yield Text(f"  confounded on this log with: {', '.join(effect['confused_with'])}")
-    estimates = [
-        *result.get("parameters", []),
-        *(p for e in result.get("effects", []) for p in e["parameters"]),
-    ]
+    estimates = [*result.get("parameters", []), *(p for e in result.get("effects", []) for p in e["parameters"])]
     if estimates:
         yield parameters_table(estimates)
         for p in estimates:

@@ -123,8 +123,7 @@ class Termination(Enum):
 
     CONVERGED = "Converged: the search finds nothing better within its tolerance."
     BUDGET_SPENT = (
-        "The budget was spent before the fit converged: raise it, or resume from the journal with a "
-        "larger one."
+        "The budget was spent before the fit converged: raise it, or resume from the journal with a larger one."
     )
     ITERATION_LIMIT = (
         "The iteration limit was reached while the loss was still falling: raise the limit, "
@@ -195,13 +194,7 @@ class Estimator(Protocol):
         ...
 
     def fit(
-        self,
-        problem: Problem,
-        *,
-        rng: np.random.Generator,
-        budget: Budget,
-        journal: Journal,
-        progress: Progress,
+        self, problem: Problem, *, rng: np.random.Generator, budget: Budget, journal: Journal, progress: Progress
     ) -> FitResult:
         """Minimise ``problem.loss`` within its bounds."""
         ...

@@ -173,6 +173,4 @@ def _refusal(algorithm: str) -> str:
 
     close = get_close_matches(algorithm.upper(), ALGORITHMS, n=3, cutoff=0.4)
     hint = f" Did you mean {' or '.join(close)}?" if close else ""
-    return (
-        f"there is no derivative-free algorithm 'nlopt:{algorithm}'.{hint} There are {', '.join(ALGORITHMS)}"
-    )
+    return f"there is no derivative-free algorithm 'nlopt:{algorithm}'.{hint} There are {', '.join(ALGORITHMS)}"

@@ -10,15 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import SysidError, UsageError
-from sysid_btr.estimators.base import (
-    Budget,
-    FitResult,
-    Problem,
-    Progress,
-    ResidualProblem,
-    Termination,
-    UnitBox,
-)
+from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, ResidualProblem, Termination, UnitBox
 from sysid_btr.estimators.journal import Journal, Record
 
 AT_BOUND = 1e-6
@@ -127,9 +119,7 @@ class Evaluator:
             raise Stop(Termination.BUDGET_SPENT)
         return losses
 
-    def reduce(
-        self, problem: ResidualProblem, candidates: FloatArray, reduction: Reduction, note: str = ""
-    ) -> Reduced:
+    def reduce(self, problem: ResidualProblem, candidates: FloatArray, reduction: Reduction, note: str = "") -> Reduced:
         """Residuals of candidates ``(m, p)``, reduced to what the estimator needs of them.
 
         Residuals are large; only what `reduction` returns is kept and journalled. It is called only for
@@ -144,9 +134,7 @@ class Evaluator:
             self._check_time(np.empty(0), asked, note)
             rows = self._simulate(problem.residuals, asked)
             if rows.ndim != 2 or len(rows) != len(asked):
-                raise SysidError(
-                    f"the problem returned residuals of shape {rows.shape} for {len(asked)} candidates"
-                )
+                raise SysidError(f"the problem returned residuals of shape {rows.shape} for {len(asked)} candidates")
             with np.errstate(over="ignore", invalid="ignore"):
                 loss = _finite_or_inf(np.einsum("ij,ij->i", rows, rows))
             arrays, large = reduction(rows)
@@ -159,9 +147,7 @@ class Evaluator:
     def _admit(self, candidates: FloatArray) -> FloatArray:
         asked = np.ascontiguousarray(candidates, dtype=np.float64)
         if asked.ndim != 2 or asked.shape[1] != len(self.start) or not np.all(np.isfinite(asked)):
-            raise ValueError(
-                f"candidates must be finite and of shape (m, {len(self.start)}), not {asked.shape}"
-            )
+            raise ValueError(f"candidates must be finite and of shape (m, {len(self.start)}), not {asked.shape}")
         return np.clip(asked, self.box.lower, self.box.upper)
 
     def _check_time(self, losses: FloatArray, paid: FloatArray, note: str) -> None:
@@ -179,9 +165,7 @@ class Evaluator:
     def _simulate_loss(self, candidates: FloatArray) -> Record:
         losses = self._simulate(self.problem.loss, candidates)
         if losses.shape != (len(candidates),):
-            raise SysidError(
-                f"the problem returned losses of shape {losses.shape} for {len(candidates)} candidates"
-            )
+            raise SysidError(f"the problem returned losses of shape {losses.shape} for {len(candidates)} candidates")
         return Record("loss", candidates, {"loss": _finite_or_inf(losses)}, self.seconds)
 
     def _account(self, candidates: FloatArray, losses: FloatArray, note: str) -> None:
@@ -207,12 +191,7 @@ class Outcome:
 
 
 def drive(
-    problem: Problem,
-    search: Callable[[Evaluator], Outcome],
-    *,
-    budget: Budget,
-    journal: Journal,
-    progress: Progress,
+    problem: Problem, search: Callable[[Evaluator], Outcome], *, budget: Budget, journal: Journal, progress: Progress
 ) -> FitResult:
     """Run a search to its end, a spent budget or an interruption, and make the result.
 

@@ -38,9 +38,7 @@ from sysid_btr.estimators.starting import finite_near, latin_hypercube
 if TYPE_CHECKING:
     from numpy.random import Generator
 
-_SMALLEST_CHANGE = (
-    1e-6  # of the residual norm: a stencil that changes less is widened, to stay above round-off
-)
+_SMALLEST_CHANGE = 1e-6  # of the residual norm: a stencil that changes less is widened, to stay above round-off
 _WIDEST_STEP = 1e-2  # of the bounds' range, to which a stencil that changes too little is widened
 _WIDEST_ASKED = 5e-2  # of the same, that may be asked for where the residuals are rough
 _STD_FRACTION = 1e-2  # a step shorter than 0.1 std lowers the loss by less than this times loss / r
@@ -276,9 +274,7 @@ class LeastSquares:
         if not self.damping or min(self.damping + self.rescue) <= 0.0:
             raise UsageError("lsq: damping needs at least one factor, and all factors above 0")
         if not (0.0 < self.forward_step <= _WIDEST_ASKED and 0.0 < self.central_step <= _WIDEST_ASKED):
-            raise UsageError(
-                f"lsq: finite-difference steps are fractions of the range in (0, {_WIDEST_ASKED:g}]"
-            )
+            raise UsageError(f"lsq: finite-difference steps are fractions of the range in (0, {_WIDEST_ASKED:g}]")
 
     @property
     def name(self) -> str:
@@ -477,20 +473,13 @@ def linearise(
     central = _Scheme(_Stencil.central, central=True, rank_tolerance=0.0)
     model, _ = _linearise(residual_problem, evaluator, u, np.full(len(u), step), central, "Jacobian")
     if not np.isfinite(model.loss):
-        raise UsageError(
-            "there is no Jacobian where the simulation fails: the residuals at this point are not finite"
-        )
+        raise UsageError("there is no Jacobian where the simulation fails: the residuals at this point are not finite")
     residual, jacobian = _unpack(model, evaluator.box)
     return residual, jacobian
 
 
 def _linearise(
-    problem: ResidualProblem,
-    evaluator: Evaluator,
-    u: FloatArray,
-    steps: FloatArray,
-    scheme: _Scheme,
-    note: str,
+    problem: ResidualProblem, evaluator: Evaluator, u: FloatArray, steps: FloatArray, scheme: _Scheme, note: str
 ) -> tuple[_Linear, FloatArray]:
     """The model about `u`, and the finite-difference steps for the next one."""
     for _ in range(3):

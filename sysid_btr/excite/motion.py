@@ -221,9 +221,7 @@ def _largest(wave: FloatArray, rest: FloatArray, low: float, high: float) -> flo
     return float(max(np.min(room[there] / size[there], initial=np.inf), 0.0))
 
 
-def find_motors(
-    robot: Robot, motion: MotionSettings | None = None, reference: Log | None = None
-) -> tuple[Limits, ...]:
+def find_motors(robot: Robot, motion: MotionSettings | None = None, reference: Log | None = None) -> tuple[Limits, ...]:
     """Motors of a robot and what their commands may do.
 
     Position: the joint's range in the model less a margin at either end, and the servo's control range; where the

@@ -82,10 +82,7 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
                         "joints": list(m.joints),
                         "position": {"limits": [m.low, m.high], "used": [float(q.min()), float(q.max())]},
                         "velocity": {"limit": m.velocity, "used": float(np.abs(np.diff(q)).max() / step)},
-                        "acceleration": {
-                            "limit": m.acceleration,
-                            "used": float(np.abs(np.diff(q, 2)).max() / step**2),
-                        },
+                        "acceleration": {"limit": m.acceleration, "used": float(np.abs(np.diff(q, 2)).max() / step**2)},
                     }
                     for m, q in zip(family.motors, commands.T, strict=True)
                 ],
@@ -115,7 +112,7 @@ def message(design: Design) -> str:
     count = sum(e.identifiable != "no" for e in design.designed.estimates)
     parts = [
         f"{count} of {len(design.designed.estimates)} parameters are identifiable from this motion of "
-        f"{design.family.clock.seconds:g} s",
+        f"{design.family.clock.seconds:g} s"
     ]
     if any(design.identifiable):
         parts.append(

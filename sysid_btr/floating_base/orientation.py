@@ -26,11 +26,7 @@ def up_in_base(angle_x: FloatArray, angle_y: FloatArray) -> FloatArray:
 
 
 def smooth_orientation(
-    time: FloatArray,
-    gyro: FloatArray,
-    up: FloatArray,
-    gyro_std: float,
-    up_std: FloatArray,
+    time: FloatArray, gyro: FloatArray, up: FloatArray, gyro_std: float, up_std: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Orientation of the base in the world, (n, 3, 3), and its standard deviation about the world's axes, (n, 3).
 

@@ -290,10 +290,7 @@ def split_episode(robot: Robot, log: Log, holdout: float, threads: int = 0) -> t
     return made
 
 
-KINDS = {
-    "fixed": "sysid_btr.identify.episode:FixedEpisode",
-    "free": "sysid_btr.floating_base.episode:FloatingEpisode",
-}
+KINDS = {"fixed": "sysid_btr.identify.episode:FixedEpisode", "free": "sysid_btr.floating_base.episode:FloatingEpisode"}
 """Mount of a log -> its kind of episode. By name: floating bases are a wing above this one."""
 
 

@@ -145,12 +145,7 @@ def estimates(
 
 
 def tell(
-    i: int,
-    parameters: Sequence[Parameter],
-    std: FloatArray,
-    norm: FloatArray,
-    cov: FloatArray,
-    span: float,
+    i: int, parameters: Sequence[Parameter], std: FloatArray, norm: FloatArray, cov: FloatArray, span: float
 ) -> tuple[Identifiable, str]:
     """Whether parameter `i` is identifiable, and if not, why.
 

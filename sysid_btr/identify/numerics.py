@@ -30,9 +30,7 @@ is followed by a check of the fitted parameters themselves (`identify.check_nume
 CHECK_SECONDS = 12.0
 
 
-def choose_numerics(
-    robot: Robot, log: Log, threads: int = 0, simulator: str = MUJOCO
-) -> tuple[Numerics, float]:
+def choose_numerics(robot: Robot, log: Log, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
     """Integrator and step for a log, and the change in noise floors when the step is halved.
 
     A log that states its servo's period is replayed by one explicit Euler step a period, which is how a servo

@@ -152,10 +152,7 @@ def profile_curve(
         best=float(values[int(np.argmin(loss))]),
         std=min(std, span),
         threshold=threshold,
-        interval=(
-            limits[0] if ends[0] is None else ends[0],
-            limits[1] if ends[1] is None else ends[1],
-        ),
+        interval=(limits[0] if ends[0] is None else ends[0], limits[1] if ends[1] is None else ends[1]),
         closed=(ends[0] is not None, ends[1] is not None),
         replays=sum(n for _, _, n in rows),
     )

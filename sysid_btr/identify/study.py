@@ -87,9 +87,7 @@ class Study:
         return ReplayProblem(tuple(self._compare(e, model.terms) for e in episodes), model.values, self.executor)
 
     def _compare(self, episode: Episode, terms: Terms) -> Comparison:
-        return episode.compare(
-            terms, self.channels, self.numerics, inflation=self.inflation, threads=self.threads
-        )
+        return episode.compare(terms, self.channels, self.numerics, inflation=self.inflation, threads=self.threads)
 
     def section(self) -> Journal:
         """What the next search keeps its record in."""
@@ -228,9 +226,7 @@ def _refuse_repeats(recordings: Iterable[Log]) -> None:
         )
 
 
-def measure_scales(
-    robot: Robot, episodes: Sequence[Episode], numerics: Numerics, threads: int = 0
-) -> Scales:
+def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics, threads: int = 0) -> Scales:
     """Sizes at every joint, from replays of the plain model."""
     torque, velocity, acceleration, span = [], [], [], []
     measured: dict[str, list[FloatArray]] = {}

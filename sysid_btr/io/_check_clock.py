@@ -42,9 +42,7 @@ def check_clock(log: Log) -> Iterator[Problem]:
             "record some seconds",
         )
     numbers = [int(log.episode[rows.start]) for rows in log.episodes()]
-    scattered = (
-        sorted({number for number in numbers if numbers.count(number) > 1}) if len(numbers) < 10_000 else []
-    )
+    scattered = sorted({number for number in numbers if numbers.count(number) > 1}) if len(numbers) < 10_000 else []
     if scattered or len(numbers) >= 10_000:
         which = f"episode {scattered[0]} appears again" if scattered else "the number changes all the time"
         yield Problem(
@@ -111,9 +109,7 @@ def _rate(log: Log) -> Iterator[Problem]:
     nominal = log.meta.sample_period
     if interval >= _SLOWEST_SAMPLE:
         exponent = 3 * round(np.log10(interval / (nominal or 0.01)) / 3)
-        unit = {3: "milliseconds", 6: "microseconds", 9: "nanoseconds"}.get(
-            exponent, "some other unit"
-        )
+        unit = {3: "milliseconds", 6: "microseconds", 9: "nanoseconds"}.get(exponent, "some other unit")
         remedy = (
             f"divide time by 1e{exponent}"
             if exponent in (3, 6, 9)
@@ -156,9 +152,7 @@ def _rate(log: Log) -> Iterator[Problem]:
         lengths = [log.time[stop - 1] - log.time[start] for start, stop in found]
         lost = sum(round(float(length) / typical_interval(log.time)) - 1 for length in lengths)
         start, stop = found[int(np.argmax(lengths))]
-        longest = (
-            f"; the longest is {max(lengths):.4g} s, from {at(log, start, stop)}" if len(found) > 1 else ""
-        )
+        longest = f"; the longest is {max(lengths):.4g} s, from {at(log, start, stop)}" if len(found) > 1 else ""
         yield Problem(
             "time.gap",
             "warning",

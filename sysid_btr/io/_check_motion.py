@@ -38,9 +38,7 @@ def check_motion(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem
             "swap the position columns (or the command columns) of these joints; check the rest of that side",
         )
     explained = {joint for pair in swapped for joint in pair}
-    flipped = [
-        joint for joint in tracking if joint not in explained and _flipped(log, joint, tracking[joint])
-    ]
+    flipped = [joint for joint in tracking if joint not in explained and _flipped(log, joint, tracking[joint])]
     if flipped:
         yield Problem(
             "joint.sign",

@@ -103,9 +103,7 @@ def check_declared_units(log: Log) -> Iterator[Problem]:
                 )
         elif _normal(unit) not in {_normal(allowed) for allowed in _ALLOWED[group]}:
             conversion = _CONVERSIONS.get(_normal(unit))
-            shown = [allowed for allowed in ("rad", "m") if group in ("command", "position")] or [
-                _ALLOWED[group][0]
-            ]
+            shown = [allowed for allowed in ("rad", "m") if group in ("command", "position")] or [_ALLOWED[group][0]]
             if group == "velocity":
                 shown = ["rad/s", "m/s"]
             wanted = " or ".join(shown)
@@ -129,9 +127,7 @@ def is_linear(log: Log, joint: str) -> bool:
 def _not_radians(log: Log, column: str) -> bool:
     """Whether another unit is declared, or radians are declared for this very column."""
     unit = log.meta.unit(column)
-    return column in log.meta.units or (
-        unit is not None and _normal(unit) not in ("rad", "radian", "radians")
-    )
+    return column in log.meta.units or (unit is not None and _normal(unit) not in ("rad", "radian", "radians"))
 
 
 def _peak(values: FloatArray) -> float:
@@ -301,9 +297,7 @@ def _acceleration_in_g(log: Log) -> Iterator[Problem]:
         )
 
 
-def _outside_range(
-    log: Log, ranges: Mapping[str, tuple[float, float]], explained: set[str]
-) -> Iterator[Problem]:
+def _outside_range(log: Log, ranges: Mapping[str, tuple[float, float]], explained: set[str]) -> Iterator[Problem]:
     outside: list[str] = []
     for joint, (low, high) in ranges.items():
         column = f"position.{joint}"
@@ -313,9 +307,7 @@ def _outside_range(
         values = values[np.isfinite(values)]
         margin = 0.05 * (high - low)
         if len(values) and (values.min() < low - margin or values.max() > high + margin):
-            outside.append(
-                f"{joint} {values.min():.3g} to {values.max():.3g} (allowed {low:.3g} to {high:.3g})"
-            )
+            outside.append(f"{joint} {values.min():.3g} to {values.max():.3g} (allowed {low:.3g} to {high:.3g})")
     if outside:
         yield Problem(
             "position.range",

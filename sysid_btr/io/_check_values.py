@@ -18,9 +18,7 @@ _ABSURD = 1e9  # beyond any encoder count or force; also keeps squares of what f
 
 def plausible(log: Log) -> Log:
     """The log with infinite and absurd values made missing, for checks that look at motion."""
-    channels = {
-        name: np.where(np.abs(values) < _ABSURD, values, np.nan) for name, values in log.channels.items()
-    }
+    channels = {name: np.where(np.abs(values) < _ABSURD, values, np.nan) for name, values in log.channels.items()}
     return replace(log, channels=channels)
 
 
@@ -36,9 +34,7 @@ def check_values(log: Log) -> Iterator[Problem]:
             f"{sum(int(np.sum(f)) for f in infinite.values())} values are infinite",
             "a division by zero or an overflow in the recorder: set these values to NaN (missing)",
         )
-    absurd = {
-        name: np.isfinite(values) & (np.abs(values) >= _ABSURD) for name, values in log.channels.items()
-    }
+    absurd = {name: np.isfinite(values) & (np.abs(values) >= _ABSURD) for name, values in log.channels.items()}
     absurd = {name: flags for name, flags in absurd.items() if np.any(flags)}
     if absurd:
         flags = np.any(list(absurd.values()), axis=0)

@@ -91,9 +91,7 @@ def _unreadable(path: Path) -> Problem | None:
         return Problem(code, "error", str(path), message, remedy)
 
     if not path.exists():
-        return problem(
-            "file.missing", "the file does not exist", f"check the path; looked in {path.parent.resolve()}"
-        )
+        return problem("file.missing", "the file does not exist", f"check the path; looked in {path.parent.resolve()}")
     if not path.is_file():
         return problem(
             "file.not_a_file",
@@ -108,9 +106,7 @@ def _unreadable(path: Path) -> Problem | None:
             file.seek(max(size - 4, 0))
             tail = file.read(4)
     except OSError as error:
-        return problem(
-            "file.unreadable", f"the file cannot be read ({_one_line(error)})", "check its permissions"
-        )
+        return problem("file.unreadable", f"the file cannot be read ({_one_line(error)})", "check its permissions")
     if size == 0:
         return problem("file.empty", "the file has 0 bytes", "record or copy it again")
     if head.startswith(_MAGIC) and tail == _MAGIC and size >= 12:
@@ -160,12 +156,7 @@ def _meta(metadata: Mapping[bytes, bytes], problems: list[Problem]) -> LogMeta:
     try:
         raw = json.loads(metadata[METADATA_KEY])
     except ValueError as error:
-        report(
-            "meta.json",
-            "file metadata `sysid_btr`",
-            f"not valid JSON ({error})",
-            f"write e.g. {_EXAMPLE_META}",
-        )
+        report("meta.json", "file metadata `sysid_btr`", f"not valid JSON ({error})", f"write e.g. {_EXAMPLE_META}")
         return LogMeta()
     if not isinstance(raw, dict):
         report("meta.json", "file metadata `sysid_btr`", "not a JSON object", f"write e.g. {_EXAMPLE_META}")
@@ -195,11 +186,7 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
 
     version = raw.get("schema")
     if version != SCHEMA_VERSION or isinstance(version, bool):
-        said = (
-            "no schema version is given"
-            if version is None
-            else f"schema version {json.dumps(version)} is unknown"
-        )
+        said = "no schema version is given" if version is None else f"schema version {json.dumps(version)} is unknown"
         newer = isinstance(version, int) and version > SCHEMA_VERSION
         problems.append(
             Problem(
@@ -207,9 +194,7 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
                 "error",
                 "file metadata, `schema`",
                 f"{said}; this release reads version {SCHEMA_VERSION}",
-                "update sysid_btr"
-                if newer
-                else f'set "schema": {SCHEMA_VERSION} if the columns follow that schema',
+                "update sysid_btr" if newer else f'set "schema": {SCHEMA_VERSION} if the columns follow that schema',
             )
         )
     for key in ("robot", "source", "notes"):
@@ -244,9 +229,7 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
 
 
 def _positive(value: object) -> bool:
-    return (
-        isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
-    )
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
 
 
 # --- columns ------------------------------------------------------------------------------------------------
@@ -302,9 +285,7 @@ def _log(table: pa.Table, meta: LogMeta, path: Path, problems: list[Problem]) ->
     return Log(time=time, channels=channels, meta=meta, episode=episode, path=path, unknown=unknown)
 
 
-def _time(
-    columns: Mapping[str, pa.ChunkedArray], meta: LogMeta, n: int, problems: list[Problem]
-) -> FloatArray | None:
+def _time(columns: Mapping[str, pa.ChunkedArray], meta: LogMeta, n: int, problems: list[Problem]) -> FloatArray | None:
     found = _seconds(columns["time"], meta) if "time" in columns else None
     if found is not None:
         return found

@@ -92,12 +92,8 @@ def write_log(log: Log, path: str | os.PathLike[str], *, overwrite: bool = False
         try:
             columns[name] = pa.array(values)
         except (pa.ArrowException, TypeError) as error:
-            raise LogError(
-                f"cannot write {path}: column {name} cannot be stored as Parquet ({error})"
-            ) from error
-    table = pa.table(columns).replace_schema_metadata(
-        {METADATA_KEY: json.dumps(meta_to_json(log.meta)).encode()}
-    )
+            raise LogError(f"cannot write {path}: column {name} cannot be stored as Parquet ({error})") from error
+    table = pa.table(columns).replace_schema_metadata({METADATA_KEY: json.dumps(meta_to_json(log.meta)).encode()})
 
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
@@ -108,9 +104,7 @@ def write_log(log: Log, path: str | os.PathLike[str], *, overwrite: bool = False
         part.replace(path)
     except OSError as error:
         reason = error.strerror or error
-        raise UsageError(
-            f"cannot write {path}: {reason}; choose a writable folder with enough space"
-        ) from error
+        raise UsageError(f"cannot write {path}: {reason}; choose a writable folder with enough space") from error
     finally:
         part.unlink(missing_ok=True)
 
@@ -136,8 +130,7 @@ def meta_to_json(meta: LogMeta) -> dict[str, Any]:
     known = {
         f.name: getattr(meta, f.name)
         for f in fields(LogMeta)
-        if f.name != "extra"
-        and (f.name in _ALWAYS_WRITTEN or getattr(meta, f.name) != getattr(default, f.name))
+        if f.name != "extra" and (f.name in _ALWAYS_WRITTEN or getattr(meta, f.name) != getattr(default, f.name))
     }
     if "units" in known:
         known["units"] = dict(meta.units)

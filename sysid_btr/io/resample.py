@@ -133,9 +133,7 @@ def _fill_forward(values: FloatArray) -> FloatArray:
     known = ~np.isnan(values)
     rows = np.arange(len(values))[:, None]
     last = np.maximum.accumulate(np.where(known, rows, -1), axis=0)
-    filled: FloatArray = np.take_along_axis(
-        values, np.where(last < 0, np.argmax(known, axis=0), last), axis=0
-    )
+    filled: FloatArray = np.take_along_axis(values, np.where(last < 0, np.argmax(known, axis=0), last), axis=0)
     return filled
 
 
@@ -143,9 +141,7 @@ def _resample_episode(log: Log, period: float) -> Log:
     time = log.time
     duration = time[-1] - time[0]
     if duration / period > _MAX_SAMPLES:
-        raise UsageError(
-            f"resampling {duration:.6g} s every {period:.3g} s would give {duration / period:.2g} samples"
-        )
+        raise UsageError(f"resampling {duration:.6g} s every {period:.3g} s would give {duration / period:.2g} samples")
     # The end of the log counts as on the grid despite the rounding of its time stamp.
     interval = typical_interval(time)
     slack = 1e-6 + (SNAP * min(interval / period, 1.0) if len(log) > 1 else 0.0)

@@ -20,10 +20,7 @@ __all__ = ["Problem", "validate_file", "validate_log"]
 
 
 def validate_log(
-    log: Log,
-    *,
-    joints: Sequence[str] | None = None,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
+    log: Log, *, joints: Sequence[str] | None = None, ranges: Mapping[str, tuple[float, float]] | None = None
 ) -> tuple[Problem, ...]:
     """Problems of a log's content.
 
@@ -45,9 +42,7 @@ def validate_log(
         Errors first; empty for a good log. Problems of one kind in many columns are one entry.
     """
     if len(log) == 0:
-        return (
-            Problem("log.empty", "error", "time", "the log has no samples", "record some seconds of motion"),
-        )
+        return (Problem("log.empty", "error", "time", "the log has no samples", "record some seconds of motion"),)
     motion = plausible(log)
     tracking = trackings(motion)
     found = [

@@ -180,9 +180,7 @@ def _add_leg(trunk: Any, leg: str) -> None:
         return geom, end
 
     coxa = trunk.add_body(
-        name=leg + "Coxa",
-        pos=[along, side * TRUNK[1], 0.0],
-        quat=[cos(heading / 2), 0.0, 0.0, sin(heading / 2)],
+        name=leg + "Coxa", pos=[along, side * TRUNK[1], 0.0], quat=[cos(heading / 2), 0.0, 0.0, sin(heading / 2)]
     )
     coxa.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.02, contype=0, conaffinity=0)
     hinge(coxa, "Coxa", [0.0, 0.0, side], -0.8, 0.8)

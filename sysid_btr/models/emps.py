@@ -48,13 +48,7 @@ def _make_spec() -> mujoco.MjSpec:
         range=list(TRAVEL),
         limited=mujoco.mjtLimited.mjLIMITED_FALSE,
     )
-    carriage.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[0.1, 0.1, 0.05],
-        mass=MASS,
-        contype=0,
-        conaffinity=0,
-    )
+    carriage.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.05], mass=MASS, contype=0, conaffinity=0)
     damping = DRIVE_GAIN * VELOCITY_GAIN
     servo = spec.add_actuator(name="slider", target="slider", trntype=mujoco.mjtTrn.mjTRN_JOINT)
     servo.set_to_position(kp=damping * POSITION_GAIN, kv=damping)

@@ -247,9 +247,7 @@ def _make_spec(parts: tuple[Part, ...]) -> mujoco.MjSpec:
     root.pos = _world((torso.anchor[0], torso.anchor[1] - sole, torso.anchor[2]))
     root.add_freejoint(name="root")
     for pair in TIED:
-        tie = spec.add_equality(
-            name="_".join(pair), type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT
-        )
+        tie = spec.add_equality(name="_".join(pair), type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT)
         tie.name1, tie.name2 = pair
         tie.data[:5] = [0.0, 1.0, 0.0, 0.0, 0.0]
         tie.solref = [0.01, 1.0]
@@ -297,10 +295,7 @@ def _add_sensors(spec: mujoco.MjSpec, parts: tuple[Part, ...], bodies: dict[str,
     for part in parts:
         if part.servo is not None:
             spec.add_sensor(
-                name=f"position_{part.name}",
-                type=mujoco.mjtSensor.mjSENS_JOINTPOS,
-                objtype=joint,
-                objname=part.name,
+                name=f"position_{part.name}", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=joint, objname=part.name
             )
     torso = next(p for p in parts if not p.parent)
     bodies[torso.name].add_site(name="imu", pos=_world(torso.offset))
@@ -329,8 +324,5 @@ def _add_foot_sensors(spec: mujoco.MjSpec, part: Part, body: Any) -> None:
                 size=[length / 4 + EDGE, width / 4 + EDGE, EDGE],
             )
             spec.add_sensor(
-                name=f"force_{name}",
-                type=mujoco.mjtSensor.mjSENS_TOUCH,
-                objtype=mujoco.mjtObj.mjOBJ_SITE,
-                objname=name,
+                name=f"force_{name}", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=name
             )

@@ -168,9 +168,7 @@ def phi1(real: FloatArray, simulated: FloatArray) -> FloatArray:
     return np.asarray(np.mean(np.abs(np.atleast_2d(simulated) - real), axis=1))
 
 
-def information_distance(
-    x: IntArray, y: IntArray, correction: Literal["miller-madow", "none"] = "none"
-) -> float:
+def information_distance(x: IntArray, y: IntArray, correction: Literal["miller-madow", "none"] = "none") -> float:
     """d(X, Y) = H(X|Y) + H(Y|X) = 2 H(X, Y) - H(X) - H(Y) of two series of labels, bits."""
     joint = x.astype(np.int64) * (int(y.max()) + 1) + y
     corrected = correction == "miller-madow"

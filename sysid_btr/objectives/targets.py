@@ -83,9 +83,7 @@ def make_targets(
     return log.once(("targets", joints, channels, warm_up), lambda: _make_targets(log, joints, channels, warm_up))
 
 
-def _make_targets(
-    log: Log, joints: tuple[str, ...], channels: tuple[str, ...], warm_up: float
-) -> tuple[Target, ...]:
+def _make_targets(log: Log, joints: tuple[str, ...], channels: tuple[str, ...], warm_up: float) -> tuple[Target, ...]:
     time = log.time - log.time[0]
     targets = []
     for channel in channels:

@@ -56,10 +56,7 @@ def to_datatree(posterior: Posterior) -> Any:
     tree = base.from_dict(
         {
             "posterior": {name: as_chains(drawn.draws[..., j]) for j, name in enumerate(names)},
-            "sample_stats": {
-                "lp": as_chains(drawn.log_density),
-                "log_likelihood": as_chains(drawn.log_likelihood),
-            },
+            "sample_stats": {"lp": as_chains(drawn.log_density), "log_likelihood": as_chains(drawn.log_likelihood)},
         },
         check_conventions=False,  # many short chains are what an ensemble is
         attrs={

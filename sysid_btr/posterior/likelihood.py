@@ -115,13 +115,7 @@ def make_likelihood(
         inflation, turn = np.linalg.eigh(spread)
         share = 1.0 / inflation
         frame = turn.T @ whitening
-    return Likelihood(
-        box=box,
-        centre=box.enter(x),
-        loss=float(residual @ residual),
-        frame=frame,
-        share=share,
-    )
+    return Likelihood(box=box, centre=box.enter(x), loss=float(residual @ residual), frame=frame, share=share)
 
 
 def settle(

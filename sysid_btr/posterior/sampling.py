@@ -314,11 +314,7 @@ class _Run:
 
     @classmethod
     def begin(
-        cls,
-        target: _Target,
-        start: tuple[FloatArray, FloatArray],
-        proposal: Proposal,
-        settings: Settings,
+        cls, target: _Target, start: tuple[FloatArray, FloatArray], proposal: Proposal, settings: Settings
     ) -> _Run:
         coordinates, density = start
         moves = [(surrogate_move(proposal), 1.0 - settings.direct), (_stretch(), settings.direct)]

@@ -62,10 +62,7 @@ def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         rows=list(_error_rows(result)),
         floors=any(floor is not None for floor in result.get("noise_floor", {}).values()),
         bars=_bars(result),
-        estimates=[
-            *result.get("parameters", []),
-            *(p for e in result.get("effects", []) for p in e["parameters"]),
-        ],
+        estimates=[*result.get("parameters", []), *(p for e in result.get("effects", []) for p in e["parameters"])],
         intervals=_intervals(result),
         pictures=[(p, _data_uri(p.light), None if p.dark is None else _data_uri(p.dark)) for p in shown],
         left_out=left_out,
@@ -84,10 +81,7 @@ def _intervals(result: Mapping[str, Any]) -> str:
         f"residuals and the replay's own numerical error; {limit}",
         "excite": "Expected of a fit to a log of this motion (the Cramer-Rao bound), compared with the same for the "
         "reference motion.",
-    }.get(
-        result["kind"],
-        f"Intervals hold for correlated residuals and for the replay's own numerical error; {limit}",
-    )
+    }.get(result["kind"], f"Intervals hold for correlated residuals and for the replay's own numerical error; {limit}")
 
 
 def _fitting(pictures: Sequence[Picture]) -> tuple[list[Picture], list[str]]:
@@ -174,10 +168,6 @@ def _bars(result: Mapping[str, Any]) -> dict[str, Any] | None:
         "names": [name for _, name in columns],
         "floor": None if floor is None else min(100 * floor / largest, 100),
         "joints": [
-            {
-                "name": j,
-                "bars": [{"width": 100 * v / largest, "text": next(texts)} for v in values[j]],
-            }
-            for j in order
+            {"name": j, "bars": [{"width": 100 * v / largest, "text": next(texts)} for v in values[j]]} for j in order
         ],
     }

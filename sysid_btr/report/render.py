@@ -238,10 +238,7 @@ def backends() -> list[str]:
 
 
 def draw(
-    scene: Scene,
-    samples: Sequence[Sequence[int]],
-    camera: FloatArray,
-    sizes: Sequence[tuple[int, int]],
+    scene: Scene, samples: Sequence[Sequence[int]], camera: FloatArray, sizes: Sequence[tuple[int, int]]
 ) -> list[Frames]:
     """Frames (samples, panels, height, width, 3) of each list of samples, drawn by the first driver that works.
 

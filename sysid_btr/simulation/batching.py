@@ -39,9 +39,7 @@ def group_replays(replays: Sequence[Replay]) -> list[tuple[int, ...]]:
     return sorted(tuple(party) for party in found)
 
 
-def batched_chunks(
-    replays: Sequence[Replay], candidates: FloatArray
-) -> Iterator[tuple[slice, tuple[Outputs, ...]]]:
+def batched_chunks(replays: Sequence[Replay], candidates: FloatArray) -> Iterator[tuple[slice, tuple[Outputs, ...]]]:
     """Predicted sensors of all replays of a party, a chunk of candidates at a time.
 
     Parameters

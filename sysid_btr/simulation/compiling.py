@@ -27,9 +27,7 @@ def made_elsewhere() -> mujoco.MjSpec:
     raise ModelError("this model was compiled in another process, and cannot be compiled again here")
 
 
-def compile_model(
-    robot: Robot, log: Log, terms: Sequence[Term], numerics: Numerics
-) -> mujoco.MjModel:
+def compile_model(robot: Robot, log: Log, terms: Sequence[Term], numerics: Numerics) -> mujoco.MjModel:
     """Compile the robot for a log: mount, integrator, step, friction numerics, added structure."""
     import mujoco
 

@@ -75,9 +75,7 @@ def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep:
     )
 
 
-def at_samples(
-    grid: Grid, position: FloatArray, velocity: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def at_samples(grid: Grid, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cubic Hermite read-out at the sample times of states kept at step borders, (m, k, j) each."""
     if not np.any(grid.fraction):
         if len(grid.state) == len(grid.before):

@@ -120,9 +120,7 @@ class Replay:
         """
         candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
         if candidates.shape[1] != len(self.parameters):
-            raise ValueError(
-                f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}"
-            )
+            raise ValueError(f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}")
         size = max(CHUNK, CHUNK_DOFS // max(self.model.nv, 1))
         for first in range(0, len(candidates), size):
             rows = slice(first, min(first + size, len(candidates)))
@@ -203,6 +201,4 @@ def _inputs_of(logs: Sequence[tuple[Log, Grid]], steps: int, rows: int) -> dict[
     """Measured drive inputs, (steps, rows), of logs that each own an equal share of the rows."""
     own = [step_inputs(log, replace(grid, command=np.empty((steps, 0)))) for log, grid in logs]
     share = rows // len(logs)
-    return {
-        name: np.repeat(np.stack([inputs[name] for inputs in own], axis=1), share, axis=1) for name in own[0]
-    }
+    return {name: np.repeat(np.stack([inputs[name] for inputs in own], axis=1), share, axis=1) for name in own[0]}

@@ -62,10 +62,7 @@ class ExternalDisturbance(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         peak = max(scale.torque_peak, 1e-9)
-        return (
-            Kind("torque", "Nm", 0.0, -20 * peak, 20 * peak, 0.1 * scale.torque_rms),
-            *cls.kinds[1:],
-        )
+        return (Kind("torque", "Nm", 0.0, -20 * peak, 20 * peak, 0.1 * scale.torque_rms), *cls.kinds[1:])
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
@@ -101,10 +98,7 @@ class ExternalDisturbanceTrain(Effect):
     title: ClassVar[str] = "push from outside that comes again and again"
     held: ClassVar[tuple[str, ...]] = ("start", "duration", "period")
     signed: ClassVar[bool] = True
-    kinds: ClassVar[tuple[Kind, ...]] = (
-        *ExternalDisturbance.kinds,
-        Kind("period", "s", 1.0, 0.01, 1e4, 0.01),
-    )
+    kinds: ClassVar[tuple[Kind, ...]] = (*ExternalDisturbance.kinds, Kind("period", "s", 1.0, 0.01, 1e4, 0.01))
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("command_delay", "a motion that does not repeat with the pushes"),
     )

@@ -250,11 +250,7 @@ class LoadFrictionStribeck(LoadFriction):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         speed = 0.2 * scale.velocity_rms
-        return (
-            cls.kinds[0],
-            cls.kinds[1],
-            Kind("velocity", "rad/s", speed, 0.02 * speed, 20 * speed, 0.5 * speed),
-        )
+        return (cls.kinds[0], cls.kinds[1], Kind("velocity", "rad/s", speed, 0.02 * speed, 20 * speed, 0.5 * speed))
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:

@@ -172,11 +172,7 @@ def _slides(model: mujoco.MjModel, place: str) -> bool:
 
 
 def _own_bounds(
-    name: str,
-    field: str,
-    place: str,
-    table: Mapping[str, tuple[float, float]],
-    default: tuple[float, float],
+    name: str, field: str, place: str, table: Mapping[str, tuple[float, float]], default: tuple[float, float]
 ) -> tuple[float, float]:
     for key in (name, f"{field}:{place}", field):
         if key in table:

@@ -244,10 +244,7 @@ class GravityTilt(Effect):
     title: ClassVar[str] = "tilt of the mount"
     scope: ClassVar = "robot"
     signed: ClassVar[bool] = True
-    kinds: ClassVar[tuple[Kind, ...]] = (
-        Kind("x", "rad", 0.0, -0.3, 0.3, 0.01),
-        Kind("y", "rad", 0.0, -0.3, 0.3, 0.01),
-    )
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("x", "rad", 0.0, -0.3, 0.3, 0.01), Kind("y", "rad", 0.0, -0.3, 0.3, 0.01))
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("com_offset", "an IMU, or several limbs"),)
 
     @classmethod

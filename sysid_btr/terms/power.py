@@ -86,10 +86,7 @@ class ThermalDerating(Effect):
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = 0.1 / max(scale.torque_rms, 1e-9) ** 2
-        return (
-            Kind("alpha", "1/Nm2", 0.0, 0.0, 50 * size, size),
-            Kind("tau", "s", 10.0, 1.0, 200.0, 5.0),
-        )
+        return (Kind("alpha", "1/Nm2", 0.0, 0.0, 50 * size, size), Kind("tau", "s", 10.0, 1.0, 200.0, 5.0))
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:

@@ -108,10 +108,7 @@ class IntegralGain(Effect):
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("ki", "Nm/(rad s)", 0.0, 0.0, 200.0, 1.0),)
     everywhere: ClassVar[bool] = True
-    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("joint_spring", "long holds"),
-        ("payload", "long holds"),
-    )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("joint_spring", "long holds"), ("payload", "long holds"))
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:

@@ -151,8 +151,7 @@ def _same(a: FitResult, b: FitResult) -> bool:
         same(a.x, b.x)
         and same(a.jacobian, b.jacobian)
         and same(a.residual, b.residual)
-        and (a.loss, a.evaluations, a.termination, a.history)
-        == (b.loss, b.evaluations, b.termination, b.history)
+        and (a.loss, a.evaluations, a.termination, a.history) == (b.loss, b.evaluations, b.termination, b.history)
     )
 
 
@@ -167,36 +166,22 @@ def check_result(estimator: Estimator) -> None:
         require(bool(inside), where + "a candidate outside the bounds was simulated")
         require(bool(np.all(np.isfinite(answered))), where + "a candidate that is not a number was simulated")
         require(len(answered) <= _EVALUATIONS, where + "the budget of evaluations was overrun")
-        require(
-            result.evaluations == len(answered), where + "result.evaluations is not the candidates simulated"
-        )
-        require(
-            bool(np.all((result.x >= problem.lower) & (result.x <= problem.upper))),
-            where + "x is out of bounds",
-        )
+        require(result.evaluations == len(answered), where + "result.evaluations is not the candidates simulated")
+        require(bool(np.all((result.x >= problem.lower) & (result.x <= problem.upper))), where + "x is out of bounds")
         require(np.isfinite(result.loss), where + "the loss of the result is not finite")
         at_x = float(problem.loss(result.x[None])[0])
         require(abs(at_x - result.loss) <= 1e-9 * at_x, where + "result.loss is not the loss at result.x")
         start = float(problem.loss(problem.start[None])[0])
         best = float(losses.min())
-        require(
-            result.loss <= best * (1.0 + _SLACK) + 1e-9 * start, where + "a clearly better candidate was seen"
-        )
+        require(result.loss <= best * (1.0 + _SLACK) + 1e-9 * start, where + "a clearly better candidate was seen")
         require(result.loss < start, where + "the result is no better than the start")
-        require(
-            result.converged is (result.termination is Termination.CONVERGED), where + "converged is wrong"
-        )
-        near = np.minimum(result.x - problem.lower, problem.upper - result.x) / (
-            problem.upper - problem.lower
-        )
+        require(result.converged is (result.termination is Termination.CONVERGED), where + "converged is wrong")
+        near = np.minimum(result.x - problem.lower, problem.upper - result.x) / (problem.upper - problem.lower)
         require(bool(np.all(result.at_bound == (near < 1e-6))), where + "at_bound is wrong")
         require(result.names == problem.names, where + "names are wrong")
         running = np.minimum.accumulate(losses)
         counts, values = np.array([n for n, _ in result.history]), np.array([v for _, v in result.history])
-        require(
-            bool(np.all(np.diff(counts) > 0) and np.all(np.diff(values) < 0)),
-            where + "history is not falling",
-        )
+        require(bool(np.all(np.diff(counts) > 0) and np.all(np.diff(values) < 0)), where + "history is not falling")
         agree = np.allclose(values, running[counts - 1], rtol=1e-9, atol=1e-9 * start)
         require(bool(agree), where + "history is not the best loss so far")
 
@@ -207,9 +192,7 @@ def check_budget(estimator: Estimator) -> None:
     for evaluations in (1, 2, 7, 50):
         witness, journal = Witness(_decay()), Journal()
         result = run(estimator, witness, evaluations=evaluations, journal=journal)
-        require(
-            len(witness.answered) <= evaluations, f"{estimator.name}: a budget of {evaluations} was overrun"
-        )
+        require(len(witness.answered) <= evaluations, f"{estimator.name}: a budget of {evaluations} was overrun")
         if whole.evaluations > evaluations:
             require(
                 result.termination is Termination.BUDGET_SPENT and not result.converged,
@@ -221,11 +204,7 @@ def check_budget(estimator: Estimator) -> None:
         )
     witness = Witness(_decay())
     timed = estimator.fit(
-        witness,
-        rng=np.random.default_rng(_SEED),
-        budget=Budget(seconds=1e-9),
-        journal=Journal(),
-        progress=silent,
+        witness, rng=np.random.default_rng(_SEED), budget=Budget(seconds=1e-9), journal=Journal(), progress=silent
     )
     require(not timed.converged, f"{estimator.name}: a spent time budget is not reported")
     require(not witness.answered, f"{estimator.name}: simulated after the time budget was spent")
@@ -241,10 +220,7 @@ def check_reproducible(estimator: Estimator) -> None:
     a, b = run(estimator, first), run(estimator, second)
     require(_same(a, b), f"{estimator.name}: the same seed gave two answers")
     require(first.asked() == second.asked(), f"{estimator.name}: the same seed asked for other candidates")
-    require(
-        bool(np.all(state == legacy_state()[1])),
-        f"{estimator.name}: draws from numpy's global random numbers",
-    )
+    require(bool(np.all(state == legacy_state()[1])), f"{estimator.name}: draws from numpy's global random numbers")
     untouched = before == (problem.lower.tobytes(), problem.upper.tobytes(), problem.start.tobytes())
     require(untouched, f"{estimator.name}: wrote into the problem's arrays")
 
@@ -258,8 +234,7 @@ def check_failing_candidates(estimator: Estimator) -> None:
     )
     require(not np.isfinite(result.loss), f"{estimator.name}: a finite loss where there is none")
     require(
-        result.x.tobytes() == hopeless().start.tobytes(),
-        f"{estimator.name}: without an answer, x must be the start",
+        result.x.tobytes() == hopeless().start.tobytes(), f"{estimator.name}: without an answer, x must be the start"
     )
 
 
@@ -276,9 +251,7 @@ def check_progress(estimator: Estimator) -> None:
     done, best = [call[0] for call in calls], [call[2] for call in calls]
     require(done == sorted(done) and done[-1] == result.evaluations, f"{estimator.name}: progress miscounts")
     require(best == sorted(best, reverse=True), f"{estimator.name}: progress forgets the best")
-    require(
-        {call[1] for call in calls} == {_EVALUATIONS}, f"{estimator.name}: progress does not tell the budget"
-    )
+    require({call[1] for call in calls} == {_EVALUATIONS}, f"{estimator.name}: progress does not tell the budget")
 
 
 def check_interruption(estimator: Estimator) -> None:
@@ -296,10 +269,7 @@ def check_interruption(estimator: Estimator) -> None:
         best = min(witness.losses, default=np.inf)
         kept = result.loss == best or abs(result.loss - best) <= 1e-9 * best
         require(kept, f"{estimator.name}: interrupted, it lost the best so far")
-        require(
-            journal.evaluations == len(witness.answered),
-            f"{estimator.name}: interrupted, it lost evaluations",
-        )
+        require(journal.evaluations == len(witness.answered), f"{estimator.name}: interrupted, it lost evaluations")
         again = Witness(_decay())
         resumed = run(estimator, again, journal=journal)
         require(_same(resumed, whole), f"{estimator.name}: resumed after Ctrl-C, the answer changed")
@@ -317,9 +287,7 @@ def check_resume(estimator: Estimator) -> None:
         for fraction in (0.2, 0.5, 0.8):
             for torn in (0, 9):
                 with tempfile.TemporaryDirectory() as folder:
-                    _check_one_resume(
-                        estimator, reference, whole, fraction, torn, Path(folder) / "fit.journal"
-                    )
+                    _check_one_resume(estimator, reference, whole, fraction, torn, Path(folder) / "fit.journal")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "fit.journal"
         whole = run(estimator, _decay(), journal=Journal(path, fingerprint="a"))
@@ -347,10 +315,7 @@ def _check_one_resume(
     resumed = run(estimator, again, journal=Journal(path))
     require(_same(resumed, whole), where + "resumed, the answer changed")
     if not torn:
-        require(
-            witness.asked() + again.asked() == reference.asked(),
-            where + "evaluations were repeated or skipped",
-        )
+        require(witness.asked() + again.asked() == reference.asked(), where + "evaluations were repeated or skipped")
     else:
         require(
             finished + len(again.answered) >= whole.evaluations and reference.asked().endswith(again.asked()),
@@ -363,11 +328,7 @@ def check_refusals(estimator: Estimator) -> None:
     with suppress(UsageError):
         run(estimator, LossOnly(_decay()))
     toy = _decay()
-    for lower, start in (
-        (toy.upper, toy.start),
-        (toy.lower, toy.upper + 1.0),
-        (toy.lower - np.inf, toy.start),
-    ):
+    for lower, start in ((toy.upper, toy.start), (toy.lower, toy.upper + 1.0), (toy.lower - np.inf, toy.start)):
         bad = ToyProblem(toy.names, lower, toy.upper, start, toy.function, toy.optimum)
         try:
             run(estimator, bad)

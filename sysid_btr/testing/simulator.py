@@ -180,9 +180,7 @@ def check_borders(simulator: Simulator) -> None:
             np.array_equal(few.position, all_of_them.position[:, some]), "states depend on which borders are asked for"
         )
         require(few.position.shape == (2, len(some), 2), f"states have the shape {few.position.shape}")
-        require(
-            (few.effort is None) == (all_of_them.effort is None), "torques depend on which borders are asked for"
-        )
+        require((few.effort is None) == (all_of_them.effort is None), "torques depend on which borders are asked for")
 
 
 def check_reproducible(simulator: Simulator) -> None:

@@ -114,8 +114,6 @@ def _dry(field: str) -> Read:
     return read
 
 
-
-
 def _in(model: mujoco.MjModel, i: int, angle: float) -> float:
     return angle if model.jnt_type[i] == HINGE else 1.0
 
@@ -241,13 +239,7 @@ FEATURES: tuple[Feature, ...] = tuple(_make_features())
 WRITTEN = frozenset(name for feature in FEATURES for name in feature.fields)
 """Compiled fields that a file states."""
 
-COUNTS: Mapping[Kind, str] = {
-    "body": "nbody",
-    "joint": "njnt",
-    "geom": "ngeom",
-    "actuator": "nu",
-    "tendon": "ntendon",
-}
+COUNTS: Mapping[Kind, str] = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "actuator": "nu", "tendon": "ntendon"}
 
 
 def count(model: mujoco.MjModel, kind: Kind) -> int:

@@ -11,16 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.writeback.features import (
-    Attributes,
-    Kind,
-    count,
-    differ,
-    of_kind,
-    same,
-    significant,
-    tensor,
-)
+from sysid_btr.writeback.features import Attributes, Kind, count, differ, of_kind, same, significant, tensor
 from sysid_btr.writeback.xmltext import (
     Edit,
     Element,
@@ -460,8 +451,7 @@ def _tendon(target: mujoco.MjModel, i: int) -> str:
     first, size = int(target.tendon_adr[i]), int(target.tendon_num[i])
     wraps = [
         element_text(
-            "joint",
-            {"joint": target.joint(int(target.wrap_objid[w])).name, "coef": number(target.wrap_prm[w])},
+            "joint", {"joint": target.joint(int(target.wrap_objid[w])).name, "coef": number(target.wrap_prm[w])}
         )
         for w in range(first, first + size)
     ]

@@ -70,9 +70,7 @@ def on_clock(series: Series, clock: FloatArray) -> FloatArray:
 
 def lateness(series: Series, clock: FloatArray) -> float:
     """Mean time from a held value's stamp to the first row that shows it, s; NaN if no row shows any."""
-    inside = (
-        series.time[(series.time >= clock[0]) & (series.time <= clock[-1])] if len(clock) else series.time
-    )
+    inside = series.time[(series.time >= clock[0]) & (series.time <= clock[-1])] if len(clock) else series.time
     if not len(inside) or not len(clock):
         return float("nan")
     shown = clock[np.minimum(np.searchsorted(clock, inside, side="left"), len(clock) - 1)]

@@ -14,15 +14,7 @@ from sysid_btr.io._clock import typical_interval
 from sysid_btr.io._text import some
 from sysid_btr.io.importers.base import Recording, Signal
 from sysid_btr.io.importers.mapping import ImportMap, JointRule
-from sysid_btr.io.importers.units import (
-    NORMALISED,
-    SI,
-    Unit,
-    group_of,
-    is_joint_column,
-    resolve,
-    signed_with_joint,
-)
+from sysid_btr.io.importers.units import NORMALISED, SI, Unit, group_of, is_joint_column, resolve, signed_with_joint
 from sysid_btr.io.log import Log, LogMeta, closest, is_schema_column
 
 _RESERVED = ("time", "episode")
@@ -84,10 +76,7 @@ def assemble(
     names = list(dict.fromkeys(name for part in parts for name in part))
     channels = {
         name: np.concatenate(
-            [
-                part[name].values if name in part else np.full(n, np.nan)
-                for part, n in zip(parts, counts, strict=True)
-            ]
+            [part[name].values if name in part else np.full(n, np.nan) for part, n in zip(parts, counts, strict=True)]
         ).astype(np.float64)
         for name in names
     }
@@ -180,9 +169,7 @@ def _units(parts: Sequence[Mapping[str, _Column]], told: ImportMap) -> dict[str,
     return units
 
 
-def _meta(
-    recordings: Sequence[Recording], told: ImportMap, units: Mapping[str, str]
-) -> tuple[LogMeta, list[str]]:
+def _meta(recordings: Sequence[Recording], told: ImportMap, units: Mapping[str, str]) -> tuple[LogMeta, list[str]]:
     """What the recordings say of themselves, and what the user says on top."""
     first = recordings[0].meta
     given = told.meta.model_dump(exclude_none=True)
@@ -191,11 +178,7 @@ def _meta(
     if "mount" not in given and not already_a_log:
         remarks.append('the base is assumed fixed (mount "fixed"); for a floating base: --mount free')
     periods = {r.meta.sample_period for r in recordings}
-    meta = replace(
-        first,
-        sample_period=periods.pop() if len(periods) == 1 else None,
-        units={**first.units, **units},
-    )
+    meta = replace(first, sample_period=periods.pop() if len(periods) == 1 else None, units={**first.units, **units})
     notes = [*(r.meta.notes for r in recordings), given.pop("notes", "")]
     return replace(meta, **given, notes="; ".join(dict.fromkeys(n for n in notes if n))), remarks
 
@@ -233,10 +216,7 @@ def _foreign(
     for name in dict.fromkeys(name for r in recordings for name in r.foreign):
         pieces = [r.foreign.get(name) for r in recordings]
         if any(p is not None and p.dtype == object for p in pieces):
-            filled = [
-                np.full(n, None) if p is None else p.astype(object)
-                for p, n in zip(pieces, counts, strict=True)
-            ]
+            filled = [np.full(n, None) if p is None else p.astype(object) for p, n in zip(pieces, counts, strict=True)]
         else:
             filled = [np.full(n, np.nan) if p is None else p for p, n in zip(pieces, counts, strict=True)]
         own = name

@@ -65,9 +65,7 @@ class Guess:
     def joints(self, channel: str) -> set[str]:
         """Names with a column in a channel."""
         return {
-            name
-            for kind, _, name in (column.partition(".") for column in self.columns.values())
-            if kind == channel
+            name for kind, _, name in (column.partition(".") for column in self.columns.values()) if kind == channel
         }
 
 
@@ -203,8 +201,7 @@ def proposal(path: Path, table: Table, found: Guess, joints: Sequence[str] | Non
         "# rate = 100        # Hz, instead, if no column holds the time",
         "",
         "[units]              # everything else is in SI: s, rad, rad/s, Nm, A, V, degC, N",
-        f"{'' if time and found.time in found.units else '# '}time = "
-        f"{_text(found.units.get(found.time or '', 'ms'))}",
+        f"{'' if time and found.time in found.units else '# '}time = {_text(found.units.get(found.time or '', 'ms'))}",
         '# position = "deg"',
         '# command = "deg"',
         "",

@@ -67,9 +67,7 @@ class LeRobotImporter:
                 "episodes = [..] in a mapping"
             )
         if not (path / INFO).is_file():
-            raise LogError(
-                f"{path}: it has no {INFO}: give the folder of the dataset that holds meta/ and data/"
-            )
+            raise LogError(f"{path}: it has no {INFO}: give the folder of the dataset that holds meta/ and data/")
         info = _info(path)
         features = info["features"]
         names = {f: _names(path, features, f, told) for f in _FEATURES if f in features}
@@ -96,9 +94,7 @@ class LeRobotImporter:
             )
         robot = info.get("robot_type")
         meta = LogMeta(robot=robot if isinstance(robot, str) else "", sample_period=1 / float(info["fps"]))
-        return Recording(
-            path, time, signals, foreign, columns["episode_index"].astype(np.int64), meta, tuple(remarks)
-        )
+        return Recording(path, time, signals, foreign, columns["episode_index"].astype(np.int64), meta, tuple(remarks))
 
 
 def _root(path: Path) -> Path | None:
@@ -113,18 +109,10 @@ def _info(path: Path) -> dict[str, Any]:
     try:
         info = json.loads((path / INFO).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise LogError(
-            f"{path / INFO}: cannot be read ({error}); download or record the dataset again"
-        ) from error
+        raise LogError(f"{path / INFO}: cannot be read ({error}); download or record the dataset again") from error
     fps = info.get("fps") if isinstance(info, dict) else None
-    if (
-        not isinstance(info, dict)
-        or not isinstance(info.get("features"), dict)
-        or not isinstance(fps, int | float)
-    ):
-        raise LogError(
-            f"{path / INFO}: not the info.json of a LeRobot dataset: it needs `fps` and `features`"
-        )
+    if not isinstance(info, dict) or not isinstance(info.get("features"), dict) or not isinstance(fps, int | float):
+        raise LogError(f"{path / INFO}: not the info.json of a LeRobot dataset: it needs `fps` and `features`")
     missing = [f for f in (STATE, ACTION) if f not in info["features"]]
     if missing or fps <= 0:
         what = f"no feature {' and no feature '.join(missing)}" if missing else f"fps is {fps}"
@@ -188,9 +176,7 @@ def _frames(
     tables = []
     for file in files:
         with pq.ParquetFile(file) as opened:
-            names = [
-                n for n in opened.schema_arrow.names if not _is_picture(opened.schema_arrow.field(n).type)
-            ]
+            names = [n for n in opened.schema_arrow.names if not _is_picture(opened.schema_arrow.field(n).type)]
             tables.append(opened.read(columns=names))
     missing = [n for n in (STATE, ACTION, "episode_index") if any(n not in t.column_names for t in tables)]
     if missing:
@@ -242,9 +228,7 @@ def _time(columns: Mapping[str, np.ndarray[Any, Any]], fps: float) -> tuple[Floa
         return nominal, []
     stamps = stamps.reshape(len(stamps))
     if nominal is not None and np.allclose(nominal, stamps, rtol=0, atol=_TOLERANCE):
-        said = (
-            "times are frame / fps, as in the dataset: when a sample was really taken is not recorded"
-        )
+        said = "times are frame / fps, as in the dataset: when a sample was really taken is not recorded"
         return nominal, [said]
     return stamps, []
 

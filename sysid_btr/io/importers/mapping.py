@@ -209,9 +209,7 @@ class ImportMap(_Part):
     def _factors_as_floats(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             return value
-        return {
-            k: float(v) if isinstance(v, int) and not isinstance(v, bool) else v for k, v in value.items()
-        }
+        return {k: float(v) if isinstance(v, int) and not isinstance(v, bool) else v for k, v in value.items()}
 
     @field_validator("units")
     @classmethod
@@ -257,10 +255,7 @@ class ImportMap(_Part):
 
     def unit(self, column: str, *names: str) -> str | float | None:
         """What was said about a column's unit: under its own name (or another of `names`), or its kind's."""
-        return next(
-            (self.units[k] for k in (column, *names, group_of(column)) if k in self.units),
-            None,
-        )
+        return next((self.units[k] for k in (column, *names, group_of(column)) if k in self.units), None)
 
     @property
     def lays_out_columns(self) -> bool:
@@ -323,9 +318,7 @@ def with_flags(
         For a unit or key that does not exist.
     """
     flags = {key: _number_or_name(text) for key, text in units}
-    wrong = [
-        f"--unit {key}={unit}: {said}" for key, unit in flags.items() if (said := _wrong_unit(key, unit))
-    ]
+    wrong = [f"--unit {key}={unit}: {said}" for key, unit in flags.items() if (said := _wrong_unit(key, unit))]
     mount = (meta or {}).get("mount")
     if mount not in (None, "fixed", "free"):
         wrong.append(f"--mount {mount}: use fixed (fixed base) or free (floating base)")

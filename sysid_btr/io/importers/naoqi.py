@@ -129,9 +129,7 @@ def _keys(table: Table) -> Iterator[tuple[str, str, str]]:
             yield key, f"force.{match['foot']}{match['cell']}", "kg"
 
 
-def _not_si(
-    table: Table, raw: str, newer: str, keys: Mapping[str, str], columns: Mapping[str, str]
-) -> str | None:
+def _not_si(table: Table, raw: str, newer: str, keys: Mapping[str, str], columns: Mapping[str, str]) -> str | None:
     """Why an older inertial key cannot be used, if so."""
     if not keys:
         return None

@@ -113,9 +113,7 @@ def _schemas(file: IO[bytes], reader: McapReader) -> Mapping[str, tuple[str, Sch
         found = {c.topic: (c.message_encoding, s) for s, c, _ in reader.iter_messages()}
         file.seek(0)
         return found
-    return {
-        c.topic: (c.message_encoding, summary.schemas.get(c.schema_id)) for c in summary.channels.values()
-    }
+    return {c.topic: (c.message_encoding, summary.schemas.get(c.schema_id)) for c in summary.channels.values()}
 
 
 def _broken(path: Path, error: Exception) -> str:

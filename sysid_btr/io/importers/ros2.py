@@ -46,9 +46,7 @@ class Ros2Importer:
                 f"Import its file by itself ({files}), or run `ros2 bag reindex`"
             )
         if path.is_file() and path.suffix not in _STORAGE:
-            raise LogError(
-                f"{path}: give the bag's folder, or its storage with a name in {' or '.join(_STORAGE)}"
-            )
+            raise LogError(f"{path}: give the bag's folder, or its storage with a name in {' or '.join(_STORAGE)}")
         try:
             reader = reader_class(path)
             reader.open()

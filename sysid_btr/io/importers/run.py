@@ -145,8 +145,7 @@ def _signed(log: Log, sources: Sequence[Path], formats: Mapping[str, str], model
     """The log with a note of where it comes from."""
     meta = log.meta
     origin = [
-        {"file": path.name, "format": formats[str(path)]}
-        | ({"sha256": sha256(path)} if path.is_file() else {})
+        {"file": path.name, "format": formats[str(path)]} | ({"sha256": sha256(path)} if path.is_file() else {})
         for path in sources
     ]
     return replace(

@@ -182,9 +182,7 @@ def _fields(line: str, separator: str) -> list[str]:
     return [f.strip() for f in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
 
 
-def _header(
-    path: Path, lines: Sequence[str], first: int, separator: str, rule: TableRule
-) -> tuple[list[str], int]:
+def _header(path: Path, lines: Sequence[str], first: int, separator: str, rule: TableRule) -> tuple[list[str], int]:
     """Names of the columns, and the line at which the values begin."""
     fields = _fields(lines[first], separator)
     numbers = sum(bool(_NUMBER.fullmatch(f)) for f in fields)
@@ -192,9 +190,7 @@ def _header(
     if rule.header is not None:
         names = rule.header
         if len(names) != len(fields):
-            raise LogError(
-                f"{path}: [table] header names {len(names)} columns, line {first + 1} has {len(fields)}"
-            )
+            raise LogError(f"{path}: [table] header names {len(names)} columns, line {first + 1} has {len(fields)}")
         return _unique(path, names), first if bare else first + 1
     if not bare:
         return _unique(path, fields), first + 1
@@ -252,12 +248,7 @@ def _decimal(body: Sequence[tuple[int, str]], separator: str) -> str:
 
 
 def _columns(
-    path: Path,
-    names: list[str],
-    body: list[tuple[int, str]],
-    separator: str,
-    decimal: str,
-    rule: TableRule,
+    path: Path, names: list[str], body: list[tuple[int, str]], separator: str, decimal: str, rule: TableRule
 ) -> Table:
     import pandas as pd
 
@@ -285,9 +276,7 @@ def _columns(
         if pd.api.types.is_numeric_dtype(column):
             columns[name] = column.to_numpy()
             continue
-        columns[name] = np.array(
-            [None if m else v for v, m in zip(column, column.isna(), strict=True)], object
-        )
+        columns[name] = np.array([None if m else v for v, m in zip(column, column.isna(), strict=True)], object)
         bad = np.flatnonzero((pd.to_numeric(column, errors="coerce").isna() & column.notna()).to_numpy())
         where = ", ".join(f"{columns[name][i]!r} in line {body[i][0]}" for i in bad[:3])
         noun = "value is not a number" if len(bad) == 1 else "values are not numbers"

@@ -140,9 +140,7 @@ def choose_roles(path: Path, topics: Mapping[str, str], rule: RosRule) -> Roles:
     command = tuple(rule.command) or tuple(
         t for t, kind in types.items() if _is_command(t, kind) and t not in rule.state
     )
-    state = tuple(rule.state) or tuple(
-        t for t, kind in types.items() if kind == JOINT_STATE and t not in command
-    )
+    state = tuple(rule.state) or tuple(t for t, kind in types.items() if kind == JOINT_STATE and t not in command)
     imus = [rule.imu] if rule.imu else [t for t, kind in types.items() if kind == IMU]
     remarks = []
     if len(imus) > 1:
@@ -178,9 +176,7 @@ def _listing(types: Mapping[str, str]) -> str:
     return some([f"{topic} ({kind})" for topic, kind in types.items()], 20)
 
 
-def proposal(
-    path: Path, types: Mapping[str, str], state: Sequence[str] = (), command: Sequence[str] = ()
-) -> str:
+def proposal(path: Path, types: Mapping[str, str], state: Sequence[str] = (), command: Sequence[str] = ()) -> str:
     """A mapping file for a bag whose topics could not be told apart."""
     joint_states = list(state) or [t for t, kind in types.items() if kind == JOINT_STATE]
     commands = list(command) or [t for t, kind in types.items() if kind in COMMANDS and t not in joint_states]
@@ -299,9 +295,7 @@ def _nanoseconds(stamp: Any) -> int:
 # --- clocks ---------------------------------------------------------------------------------------------------
 
 
-def _clock_of(
-    rows: Mapping[str, _Rows], roles: Roles, rule: RosRule
-) -> tuple[Mapping[str, bool], tuple[str, ...]]:
+def _clock_of(rows: Mapping[str, _Rows], roles: Roles, rule: RosRule) -> tuple[Mapping[str, bool], tuple[str, ...]]:
     """For each topic whether header stamps are used, and remarks. All topics must share one clock."""
     stamped = {
         t: bool(r.header) and min(r.header) > 0 and (len(r.header) < 2 or len(set(r.header)) > 1)
@@ -318,9 +312,7 @@ def _clock_of(
     bare = [t for t in (*roles.command, *roles.imu) if not stamped[t] and rows[t].values]
     if not bare and not any(not stamped[t] for t in roles.scalars):
         return stamped, ()
-    lag = np.median(
-        np.concatenate([np.subtract(rows[t].receive, rows[t].header) for t in roles.state]) / _BILLION
-    )
+    lag = np.median(np.concatenate([np.subtract(rows[t].receive, rows[t].header) for t in roles.state]) / _BILLION)
     if abs(lag) > _SAME_CLOCK:
         said = f"header stamps and times of receipt differ by {lag:.3g} s, and {some(bare or roles.scalars)} has no"
         return dict.fromkeys(rows, False), (f"{said} header stamps, so times of receipt are used for all",)
@@ -435,9 +427,7 @@ def _on_one_clock(
         raise LogError(f"{path}: the first command came after the last joint state; nothing to compare")
     if len(clock) < len(lead.time):
         waited = clock[0] - lead.time[0]
-        said.append(
-            f"{waited:.3g} s before the first command are left out: the joints' commands are unknown"
-        )
+        said.append(f"{waited:.3g} s before the first command are left out: the joints' commands are unknown")
     said.append(f"rows are the {len(clock)} stamps of {lead.source}")
     other = {s.source for s in series if not s.held and not np.array_equal(s.time, lead.time)}
     if other:
@@ -454,8 +444,6 @@ def _on_one_clock(
     later = [s.column for s in commands if s.time[0] > begin + 2 * period]
     if later:
         said.append(f"start later than the first command and have no values until then: {some(later, 8)}")
-    signals = tuple(
-        Signal(f"{s.source} {s.column}", s.column, on_clock(s, clock), s.unit) for s in series if s.column
-    )
+    signals = tuple(Signal(f"{s.source} {s.column}", s.column, on_clock(s, clock), s.unit) for s in series if s.column)
     foreign = {s.source: on_clock(s, clock) for s in series if not s.column}
     return Recording(path, clock, signals, foreign, None, replace(meta, notes=notes), tuple(said))

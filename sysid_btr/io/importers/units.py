@@ -12,10 +12,7 @@ from sysid_btr.io.log import IMU_NAMES, JOINT_CHANNELS, closest
 
 GRAVITY = 9.80665
 """m/s^2; also N per kg, as scales count."""
-NORMALISED: Mapping[str, tuple[float, float]] = {
-    "range_m100_100": (-100.0, 100.0),
-    "range_0_100": (0.0, 100.0),
-}
+NORMALISED: Mapping[str, tuple[float, float]] = {"range_m100_100": (-100.0, 100.0), "range_0_100": (0.0, 100.0)}
 """Positions as a share of the joint's calibrated range (LeRobot's names): the values at its two ends."""
 
 
@@ -94,9 +91,7 @@ _UNITS: Mapping[str, tuple[Unit, ...]] = {
     "1 fraction ratio bool boolean": (Unit("1"),),
     "% percent": (Unit("1", 1e-2),),
 }
-_BY_NAME: Mapping[str, tuple[Unit, ...]] = {
-    name: units for names, units in _UNITS.items() for name in names.split()
-}
+_BY_NAME: Mapping[str, tuple[Unit, ...]] = {name: units for names, units in _UNITS.items() for name in names.split()}
 
 
 def group_of(column: str) -> str:
@@ -113,9 +108,7 @@ def check_key(key: str) -> str | None:
         return None
     guess = closest(channel, (*SI, "imu"))
     hint = f"did you mean {guess}? " if guess else ""
-    return (
-        f"{key!r} is not a channel or column; {hint}available: {', '.join(SI)}, and columns as position.HeadYaw"
-    )
+    return f"{key!r} is not a channel or column; {hint}available: {', '.join(SI)}, and columns as position.HeadYaw"
 
 
 def resolve(unit: str | float, group: str) -> Unit:
