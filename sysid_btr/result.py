@@ -97,7 +97,7 @@ def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
 def exit_code(result: Mapping[str, Any]) -> int:
     """0, or 5 where a finished run identified nothing: not converged, or not one parameter or effect identifiable.
 
-    A parameter that the log cannot tell beside others that it can is a finding, not a failure.
+    A parameter that is not identifiable beside others that are is a finding, not a failure.
     """
     if result.get("converged") is False:
         return 5

@@ -29,7 +29,7 @@ LOGS, FEWEST = 4, 2
 EXPLAINED = 3.0
 """Position error, in noise floors, of trials, and of their beginnings, up to which nothing is looked for."""
 SAME = ("sensor_delay",)
-"""Effects not asked for: commands that are played from rest do not tell a late encoder from a late command."""
+"""Effects not asked for: commands that are played from rest do not distinguish a late encoder from a late command."""
 MINIMUM_GAIN, ROUNDS = 0.05, 2
 """Fraction of some joint's error that an effect must explain to join the model, and effects that join at once."""
 LEFT = 0.75
@@ -94,8 +94,9 @@ def _look(
 ) -> tuple[Joined, Study | None]:
     """Look for effects that are the same all over the robot, with bodies as they are and drives free.
 
-    Few trials of one gait tell masses or lengths from nothing else: free, they take the place of what is missing.
-    Step 3 corrects them afterwards. An effect joins if trials that were not fitted say so, even if more is missing.
+    Few trials of one gait do not distinguish masses or lengths from anything else: free, they take the place of what
+    is missing. Step 3 corrects them afterwards. An effect joins if trials that were not fitted say so, even if more is
+    missing.
     """
     from sysid_btr.btr.study import early_logs, trial_study
     from sysid_btr.diagnosis.close import close

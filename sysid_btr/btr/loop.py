@@ -42,7 +42,7 @@ from sysid_btr.version import __version__
 PATIENCE = 3
 """Iterations without progress after which disengagement is looked for."""
 UNCORRELATED = 0.2
-"""Rank correlation of expected and real fitness up to which the model does not tell which controller is better."""
+"""Rank correlation of expected and real fitness up to which the model does not predict which controller is better."""
 STUCK = 0.9
 """What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
 

@@ -28,7 +28,7 @@ class Option:
     metavar : what stands for its value in the help.
     short : a flag of one letter.
     least : smallest number allowed.
-    otherwise : what is done where nothing is said, if the default does not tell.
+    otherwise : what is done where nothing is said, if the default does not show it.
     beside : whether it names files, which are looked for beside the study file first.
     positional : whether it has no flag.
     name, kind, default : of the field.

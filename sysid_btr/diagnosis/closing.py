@@ -27,7 +27,7 @@ class NamedEffect:
     where : joint or body names, or ``robot``.
     parameters : how large, with intervals.
     gain_holdout : fraction of the held-out chi2 that vanishes with it.
-    confused_with : effects this log cannot tell from it.
+    confused_with : effects with which it is confounded on this log.
     sentence : the finding in words.
     """
 

@@ -229,9 +229,12 @@ def predicted_share(signal: FloatArray, design: FloatArray, block: int) -> float
     return 1 - left / total if total > 0 else 0.0
 
 
-def without(signal: FloatArray, design: FloatArray, told_by: BoolArray | None = None) -> FloatArray:
-    """What a linear model and a constant leave of a signal, or of signals (n, k); some samples (n,) tell the model."""
-    rows = slice(None) if told_by is None else told_by
+def without(signal: FloatArray, design: FloatArray, by: BoolArray | None = None) -> FloatArray:
+    """What a linear model and a constant leave of a signal, or of signals (n, k).
+
+    `by` are the samples (n,) that determine the model; None for all.
+    """
+    rows = slice(None) if by is None else by
     x = np.column_stack([np.ones(len(design)), design])
     size = np.linalg.norm(x, axis=0)
     x = x / np.where(size > 0, size, 1.0)

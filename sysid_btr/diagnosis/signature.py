@@ -167,7 +167,7 @@ def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
     if first is None:
         return None
     # what the motion explains is determined by the rest of the log, else it takes a part of the pulse
-    rest = without(one.torque, motion, told_by=first.outside(len(motion)))
+    rest = without(one.torque, motion, by=first.outside(len(motion)))
     box = signal_features.best_box(rest, shortest)
     if box is None:
         return None

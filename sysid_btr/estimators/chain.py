@@ -129,8 +129,8 @@ class Chain:
 
         def report(*, done: int, total: int | None, best: float, note: str) -> None:
             del total
-            told = f"{name}: {note}" if note else name
-            progress(done=before + done, total=budget.evaluations, best=min(best, floor), note=told)
+            noted = f"{name}: {note}" if note else name
+            progress(done=before + done, total=budget.evaluations, best=min(best, floor), note=noted)
 
         return report
 

@@ -7,7 +7,7 @@ linear problem *with* the bounds, so an active bound never spoils a step.
 Residuals are long and parameters few: an iteration keeps only the normal matrix ``J^T J`` and ``J^T r``, and
 the journal records those. Steps are taken in the unit cube of the bounds, with columns scaled to unit length
 (Marquardt 1963, doi:10.1137/0111030); directions the residuals do not see are cut from the spectrum, so
-parameters that cannot be told apart stay where they are.
+parameters that are confounded stay where they are.
 """
 
 from __future__ import annotations

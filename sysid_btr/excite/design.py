@@ -3,8 +3,8 @@
 What a motion is worth is its Fisher information under the sensors' noise floors, ``J' J`` of the whitened predicted
 sensors (Walter and Pronzato 1997, Identification of Parametric Models, chapter 6). A motion is scored by the mean
 of the standard errors that follow from it (A-optimal), each in a unit of its own, or by the volume of the
-confidence ellipsoid (D-optimal). Directions that a motion does not tell are bounded by the parameters' own bounds,
-so that a blind direction costs much, not infinitely much.
+confidence ellipsoid (D-optimal). Directions that are not identifiable from a motion are bounded by the
+parameters' own bounds, so that a blind direction costs much, not infinitely much.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def find_sensors(robot: Robot, reference: Log | None = None, noise: float | None
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What a motion will tell.
+    """What a motion will make identifiable.
 
     Attributes
     ----------

@@ -2,7 +2,7 @@
 
 Whatever the ground does, it acts on the feet alone. Here the walk is a chain of steps of one sample each, without
 contact: in each of them forces and torques that nobody knows act on the feet that may touch, and the states and these
-are what the encoders, the gyro and the vertical of the log leave most probable. What is left tells of the masses, and
+are what the encoders, the gyro and the vertical of the log leave most probable. What is left depends on the masses, and
 holds on springs, on carpet and on gravel (simultaneous estimation of inputs and states: Gillijns and De Moor 2007,
 doi:10.1016/j.automatica.2006.08.002; as one sparse least-squares problem over the walk).
 Lengths, times and speeds below are the Nao's; `BodySize` makes them those of the robot.
@@ -209,7 +209,7 @@ class _Round:
 
 
 def without_ground(problem: ReplayProblem, values: FloatArray) -> Known | None:
-    """Parameters as the walks tell them where nothing is known of the ground.
+    """Parameters from the walks where nothing is known of the ground.
 
     Parameters
     ----------
@@ -483,14 +483,14 @@ def _linearise(chain: _Chain, known: _Derivatives, ends: _Ends) -> _Round:
     solved = cho_solve_banded((band, True), linear.reshape(n * d, 1 + p))
     states = solved.reshape(n, d, 1 + p)
     missed = sides - before @ states[:-1] - after @ states[1:]
-    told = -sight @ states
-    told[:, :, 0] += seen
+    stated = -sight @ states
+    stated[:, :, 0] += seen
     kept = -states / _each(LOOSE, chain)[:, None]
-    left = np.concatenate([part.reshape(-1, 1 + p) for part in (missed, told, kept)])
+    left = np.concatenate([part.reshape(-1, 1 + p) for part in (missed, stated, kept)])
     volume = np.log(np.diagonal(factor, axis1=1, axis2=2))[chain.linked].sum() + np.log(band[0]).sum()
     surprise = float(left[:, 0] @ left[:, 0]) + 2 * float(volume)
     stretch = (chain.time / chain.size.time(BLOCK)).astype(np.int64)
-    blocks = np.concatenate([np.repeat(stretch[:w], d), np.repeat(stretch, told.shape[1]), np.repeat(stretch, d)])
+    blocks = np.concatenate([np.repeat(stretch[:w], d), np.repeat(stretch, stated.shape[1]), np.repeat(stretch, d)])
     return _Round(left, blocks, surprise, solved, ends)
 
 

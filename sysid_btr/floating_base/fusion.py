@@ -1,4 +1,4 @@
-"""What walks tell beside what they get wrong about their ground, alone and beside logs of a fixed base."""
+"""What floating-base logs are informative about beside the errors of their ground, alone and with fixed-base logs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def fuse(
 ) -> Fused:
     """What errors that every stride repeats do to estimates; beside other logs, walks count for less by them.
 
-    Weighed by the noise of its sensors alone, a walk would draw what a hanging robot tells better towards the errors
+    Weighed by the noise of its sensors alone, a walk would draw what a fixed-base log knows better towards the errors
     of its own contact. It counts as much as leaves the estimates most certain; they follow by one Gauss-Newton step.
 
     Parameters
@@ -65,10 +65,10 @@ def fuse(
         r = r + j @ step
         rows = np.where(walked_there, weight, 1.0)
         placed = np.clip(newton(there * rows[:, None], residual_there * rows) - step, -span, span)
-        told = np.hypot(placed, repeated_error(problem, j, r))
+        known = np.hypot(placed, repeated_error(problem, j, r))
         # what the ground does wrong everywhere is as much again, and more
-        more = np.where(legs, (GROUND**2 - 1) * (told**2 + _noise_of(j, walked) ** 2), 0.0)
-        return Fused(values + step, j, r, np.sqrt(told**2 + np.where(masses, GROUND_MASS**2, more)))
+        more = np.where(legs, (GROUND**2 - 1) * (known**2 + _noise_of(j, walked) ** 2), 0.0)
+        return Fused(values + step, j, r, np.sqrt(known**2 + np.where(masses, GROUND_MASS**2, more)))
 
     def doubt(found: Fused) -> float:
         std = np.sqrt(np.diag(covariance(found.jacobian, found.residual, problem.blocks)))
@@ -91,9 +91,10 @@ def _apart(
     elsewhere: Callable[[FloatArray], ReplayProblem],
     coarse: Numerics,
 ) -> Fused | None:
-    """What walks and other logs tell, each by themselves, joined by their precision; None where walks are not told so.
+    """Estimates from walks and from other logs, each by themselves, fused by their precision; None where these are not
+    to be had.
 
-    Nothing that a walk gets wrong about its ground then reaches into what a hanging robot tells.
+    Nothing that a walk gets wrong about its ground then reaches into what a fixed-base log knows.
     """
     part = _of_walks(problem)
     own, rest = jacobian[walked], residual[walked]
@@ -120,10 +121,10 @@ def _of_walks(problem: ReplayProblem) -> ReplayProblem:
 
 
 def with_motion(problem: ReplayProblem, weighed: Fused) -> Fused:
-    """A fit of walks with what their motion tells whatever the ground is.
+    """A fit of walks with what their motion gives whatever the ground is.
 
-    Both use the same encoders, so that only masses of legs are joined, which the fit tells so badly that counting its
-    part of the noise as its own does no harm. All else is what the motion tells.
+    Both use the same encoders, so that only masses of legs are fused, about which the fit is so uninformative that
+    counting its part of the noise as its own does no harm. All else is what the motion gives.
     """
     try:
         free = without_ground(problem, weighed.values)

@@ -25,7 +25,7 @@ from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms
 
 WINDOW = 0.2
-"""s of a Nao (`BodySize`), as are all times here: length of a segment where nothing tells a better one."""
+"""s of a Nao (`BodySize`), as are all times here: length of a segment where nothing speaks for a better one."""
 WIDENED = 2.0
 """Factor on the stated standard deviations of an initial state: the smoother has used the segment's samples as well."""
 FASTEST = 0.002
@@ -231,10 +231,10 @@ def choose_length(
     if not found:
         return ()
     best = np.max([information for _, information, _ in found], axis=0)
-    told = best > 0
+    informed = best > 0
     choices = []
     for seconds, information, chi2 in found:
-        gain = float(np.median(np.log(np.maximum(information[told], 1e-300) / best[told])))
+        gain = float(np.median(np.log(np.maximum(information[informed], 1e-300) / best[informed])))
         choices.append(SegmentLength(seconds, gain, chi2, gain - float(np.log(chi2))))
     return tuple(sorted(choices, key=lambda c: -c.score))
 

@@ -144,7 +144,7 @@ def smooth_joints(time: FloatArray, measured: FloatArray, second: float = 1.0, *
             (mean, np.tile(np.diag([0.1**2, 5.0**2, 100.0**2]), (b, 1, 1))),
         )
 
-    # the intensity is a property of the motion, which a stretch of it tells
+    # the intensity is a property of the motion, which a stretch of it shows
     part = np.tile(measured[:STRETCH], (1, grid))
     trial = run(part, np.tile(sigma, grid), np.tile(first, grid), np.repeat(JERKS, joints))
     best = np.argmax(trial.loglik.reshape(grid, joints), axis=0)

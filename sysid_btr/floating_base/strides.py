@@ -67,10 +67,11 @@ def of_legs(problem: ReplayProblem) -> BoolArray:
 
 
 GROUND, GROUND_MASS = 4.0, 0.5
-"""Root-mean-square error of what belongs to legs and feet over what the strides of one log tell of it by the model's
-ground, and for masses of legs (as factors of the nominal) that error itself: on 11 own walks over another ground it was
-0.31 of a shank, 0.60 of a thigh, 0.51 of a hip, whatever the strides told (`benchmarks.ground`). No part of a log
-disagrees with what its ground does everywhere. Arms and gains need nothing: 0.6 to 0.9 of what they are told."""
+"""Root-mean-square error of what belongs to legs and feet over its standard error from the strides of one log by the
+model's ground, and for masses of legs (as factors of the nominal) that error itself: on 11 own walks over another
+ground it was 0.31 of a shank, 0.60 of a thigh, 0.51 of a hip, whatever the strides gave (`benchmarks.ground`). No part
+of a log disagrees with what its ground does everywhere. Arms and gains need nothing: 0.6 to 0.9 of that standard
+error."""
 
 
 def walked_residuals(problem: ReplayProblem) -> BoolArray:

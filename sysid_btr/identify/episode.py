@@ -34,7 +34,7 @@ from sysid_btr.terms.model import Terms
 E = TypeVar("E", bound=ResidualEstimator)
 
 ROUGH_STEP = 1e-2
-"""Finite-difference step, fraction of the range, against teeth that meet: from there on, wider ones tell of no less
+"""Finite-difference step, fraction of the range, against teeth that meet: from there on, wider ones see no less
 information."""
 
 Inflation = Mapping[tuple[str, str, str], float]
@@ -43,14 +43,14 @@ Inflation = Mapping[tuple[str, str, str], float]
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """A linearised fit together with what else its episodes tell.
+    """A linearised fit together with what else its episodes are informative about.
 
     Attributes
     ----------
     values : (p,) estimates.
     jacobian, residual : (r, p) and (r,) there, each episode weighed by how much it is believed.
     error : (p,) standard deviation beyond that of pieces of the log that are independent.
-    known : parameters as these residuals and motions without a ground tell them together, where they do.
+    known : parameters as these residuals and contact-free estimation give them together, where they do.
     """
 
     values: FloatArray
@@ -118,7 +118,7 @@ class Procedure:
         *,
         follow: bool = True,
     ) -> Fused | None:
-        """What the episodes tell beside the residuals, and get wrong in them; None where these say it all.
+        """What the episodes hold beside the residuals, and get wrong in them; None where these say it all.
 
         Parameters
         ----------

@@ -144,7 +144,7 @@ def fit(
     Returns
     -------
     Fit
-        Parameters that the log cannot tell are held at their nominal value and marked.
+        Parameters that are not identifiable are fixed at their nominal value and marked.
     """
     began = perf_counter()
     terms = as_terms(study, parameters)

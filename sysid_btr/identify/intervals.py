@@ -98,7 +98,7 @@ def estimates(
     numerics_shift: FloatArray | None = None,
     known: Known | None = None,
 ) -> tuple[Estimate, ...]:
-    """Estimates with intervals and a verdict on what this log can tell.
+    """Estimates with intervals and whether each is identifiable.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def estimates(
     for i, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
         span = parameter.upper - parameter.lower
         at_bound = bool(min(value - parameter.lower, parameter.upper - value) <= 1e-6 * span)
-        state, reason = tell(i, parameters, std, norm, cov, span)
+        state, reason = identifiability(i, parameters, std, norm, cov, span)
         low = max(float(value) - float(quantile[i] * std[i]), parameter.lower)
         high = min(float(value) + float(quantile[i] * std[i]), parameter.upper)
         result.append(
@@ -144,7 +144,7 @@ def estimates(
     return tuple(result)
 
 
-def tell(
+def identifiability(
     i: int, parameters: Sequence[Parameter], std: FloatArray, norm: FloatArray, cov: FloatArray, span: float
 ) -> tuple[Identifiable, str]:
     """Whether parameter `i` is identifiable, and if not, why.

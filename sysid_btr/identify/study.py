@@ -43,8 +43,8 @@ class Study:
     channels : channels that are fitted.
     numerics : integrator and step; chosen by a convergence check.
     inflation : (mount, channel, joint) -> factor on its noise floor in what is minimised; 1 where silent. Keeps a
-        column that the model cannot explain yet from distorting parameters that others tell. What is wrong about
-        the ground is no error of a robot that hangs.
+        column that the model cannot explain yet from distorting parameters about which others are informative. What is
+        wrong about the ground is not an error of a robot that hangs.
     numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
     executor : where candidates are simulated.
     journal : record of refits, from which an interrupted search goes on; None keeps none.

@@ -132,7 +132,7 @@ class Phi1:
 
     Notes
     -----
-    One number an episode: it cannot tell more parameters than there are episodes.
+    One number an episode: no more parameters are identifiable than there are episodes.
     """
 
     fitness: Fitness = amplitude

@@ -13,7 +13,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
-from sysid_btr.identify.intervals import Estimate, tell
+from sysid_btr.identify.intervals import Estimate, identifiability
 from sysid_btr.identify.scores import score
 from sysid_btr.posterior.likelihood import make_likelihood, settle
 from sysid_btr.posterior.outcome import Posterior
@@ -108,7 +108,7 @@ def _estimates(fit: Fit, drawn: Sample, jacobian: FloatArray) -> tuple[Estimate,
     norm = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
     result = []
     for i, parameter in enumerate(parameters):
-        state, reason = tell(i, parameters, std, norm, covariance, parameter.upper - parameter.lower)
+        state, reason = identifiability(i, parameters, std, norm, covariance, parameter.upper - parameter.lower)
         near, share = AT_BOUND
         close = [np.mean(np.abs(flat[:, i] - end) < near * std[i]) for end in (parameter.lower, parameter.upper)]
         at_bound = bool(state != "no" and max(close) > share)

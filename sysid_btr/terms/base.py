@@ -222,7 +222,7 @@ class Term:
 
     name: ClassVar[str] = ""
     label: ClassVar[str] = ""
-    """In the names of its parameters, where the name alone would not tell it from another one beside it."""
+    """In the names of its parameters, where the name alone would not distinguish it from another one beside it."""
     variant: ClassVar[str] = ""
     """Tells apart two realisations under one name; empty for most."""
     field: ClassVar[str] = ""

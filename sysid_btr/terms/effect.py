@@ -37,7 +37,7 @@ class Effect(Term):
     title : in a sentence, after an amount: "0.33 Nm of dry friction".
     usual : whether it is looked for where the user names no effects.
     scope : which names it can sit at.
-    confounders : effects that leave similar traces, and what tells them apart.
+    confounders : effects that leave similar traces, and what separates them.
     needs : sensors without which it cannot be seen.
     signed : whether its amounts may have either sign.
     main : kind whose value says how large the effect is.
@@ -45,7 +45,7 @@ class Effect(Term):
     everywhere : whether it may well be alike at all places, so that the scan asks for that too.
     transient : whether it happens at some moment, so that held-out data may hold nothing of it.
     includes : simpler effects that are special cases of this one.
-    yields_to : effects that are named instead of this one where a log cannot tell them apart.
+    yields_to : effects that are named instead of this one where they are confounded on a log.
     held : kinds that a scan takes from the probe as they are, because the response is not linear in them.
     details : kinds that such an effect never goes without, so that having them makes it no less simple.
     """

@@ -71,7 +71,7 @@ class ViscousDamping(Damping):
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", 0.0, 0.0, 10.0, 0.05),)
     everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("kv", "a logged effort or current; position alone cannot tell the two apart"),
+        ("kv", "a logged effort or current; the two are confounded in positions alone"),
         ("quadratic_damping", "motion at several speeds"),
     )
 

@@ -97,7 +97,7 @@ class Armature(DofEffect):
 
 
 ARM = 0.05
-"""Distance, m, of a load whose mass a scan cannot tell from its place."""
+"""Distance, m, of a load whose mass a scan cannot distinguish from its place."""
 
 LEVERS = (0.03, 0.2)
 """Distances, m, that a scan is believed."""
@@ -143,7 +143,7 @@ class Payload(Effect):
         size = float(np.linalg.norm(moment))
         lever = size / (total * probe[0][0]) if total > 0 else 0.0
         if not LEVERS[0] <= lever <= LEVERS[1]:
-            # the mass is hardly told: begin from one that has the moment at a hand's breadth
+            # the mass is hardly identifiable: begin from one that has the moment at a hand's breadth
             if size == 0:
                 return None
             mass = min(size / ARM, cls.kinds[0].upper)

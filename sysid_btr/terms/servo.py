@@ -57,7 +57,7 @@ class Kv(Effect):
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("viscous_damping", "a logged effort or current; position alone cannot tell the two apart"),
+        ("viscous_damping", "a logged effort or current; the two are confounded in positions alone"),
     )
     scope: ClassVar[Scope] = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.0, 5.0, 0.1),)

@@ -36,7 +36,7 @@ class Backlash(Effect):
     Structure: a second joint on the link, between soft stops at +-play / 2; all damping of the joint on the link.
 
     Friction between housing and link acts on the link, that of motor and gear on the motor; which one the
-    model's own damping describes, the log must tell, so the other case is the variant `motor`.
+    model's own damping describes, the log must show, so the other case is the variant `motor`.
     """
 
     name: ClassVar[str] = "backlash"

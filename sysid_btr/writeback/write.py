@@ -49,7 +49,7 @@ class Identified:
     study : robot, logs, numerics.
     model : the terms and their values.
     estimates : of its parameters, in order.
-    held_back : names of parameters that the log cannot tell and that stay at their nominal value although the
+    held_back : names of parameters that are not identifiable and that stay at their nominal value although the
         search had moved them.
     """
 
