@@ -33,7 +33,7 @@ types: $(VENV)/installed-dev
 	$(BIN)/mypy
 
 # each worker simulates on threads of its own: threads of BLAS beside them only wait for each other
-check quick: export OPENBLAS_NUM_THREADS := 1
+check quick notebooks: export OPENBLAS_NUM_THREADS := 1
 
 check: $(VENV)/installed-dev
 	$(BIN)/python -m pytest $(PYTEST_FLAGS)

@@ -494,7 +494,7 @@ def test_a_fit_by_deferred_correction_is_that_of_the_right_integrator() -> None:
 def test_a_free_and_a_held_log_are_fitted_together() -> None:
     log, _ = record_walk(Gait(), 5.0)
     held = replace(log.window(0, 200), meta=replace(log.meta, mount="fixed"))
-    study = make_study(load_robot("nao"), [log, held], threads=2)
+    study = make_study(load_robot("nao"), [log, held], numerics=Numerics("RK4", 0.005), threads=2)
     problem = study.train_problem(study.declare(["mass:LKneePitch", "mass:RShoulderRoll"]))
     walk, gantry = (e.replay for e in problem.episodes)
     assert isinstance(walk, SegmentReplay)
