@@ -51,7 +51,15 @@ from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
-from sysid_btr.terms.sensing import EncoderOffset, EncoderOffsetInLoop, EncoderScale, EncoderScaleInLoop, SensorDelay
+from sysid_btr.terms.sensing import (
+    EncoderOffset,
+    EncoderOffsetInLoop,
+    EncoderScale,
+    EncoderScaleInLoop,
+    SensorDelay,
+    TorqueOffset,
+    TorqueScale,
+)
 from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
@@ -154,6 +162,20 @@ def test_an_encoder_scale_multiplies_what_is_seen_or_closes_the_loop() -> None:
     )
     q = solve(lambda q: KP * (COMMAND - 1.07 * q) - gravity(q))
     assert rest(EncoderScaleInLoop, [0.07]) == pytest.approx(1.07 * q, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "value", "seen"), [(TorqueOffset, 0.4, (1.0, 0.4)), (TorqueScale, -0.1, (0.9, 0.0))]
+)
+def test_a_torque_sensor_changes_what_is_seen_of_the_torque_and_no_motion(
+    effect: type[Effect], value: float, seen: tuple[float, float]
+) -> None:
+    log = swing()
+    plain, changed = run(pendulum(), log, effort=True), run(pendulum(), log, [at_arm(effect)], [value], effort=True)
+    assert plain.effort is not None
+    assert changed.effort is not None
+    np.testing.assert_array_equal(changed.position, plain.position)
+    np.testing.assert_allclose(changed.effort, seen[0] * plain.effort + seen[1], rtol=0, atol=1e-12)
 
 
 # --- constant and position-dependent torques ------------------------------------------------------------

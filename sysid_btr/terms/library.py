@@ -30,7 +30,15 @@ from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Inertia, 
 from sysid_btr.terms.initial_state import StartPosition, StartVelocity
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
-from sysid_btr.terms.sensing import EncoderOffset, EncoderOffsetInLoop, EncoderScale, EncoderScaleInLoop, SensorDelay
+from sysid_btr.terms.sensing import (
+    EncoderOffset,
+    EncoderOffsetInLoop,
+    EncoderScale,
+    EncoderScaleInLoop,
+    SensorDelay,
+    TorqueOffset,
+    TorqueScale,
+)
 from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain, Kp, Kv, TorqueConstant
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
@@ -65,6 +73,8 @@ BUILT_IN: tuple[type[Term], ...] = (
     EncoderOffsetInLoop,
     EncoderScale,
     EncoderScaleInLoop,
+    TorqueOffset,
+    TorqueScale,
     TorqueLimit,
     SpeedTorqueLimit,
     SlewLimit,

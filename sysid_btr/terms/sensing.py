@@ -1,4 +1,4 @@
-"""What the sensors of a joint show: offset, scale and delay."""
+"""What the sensors of a joint show: offset, scale and delay of its encoder, offset and scale of its torque sensor."""
 
 from __future__ import annotations
 
@@ -143,3 +143,52 @@ class SensorDelay(Effect):
             v0, v1 = take(v, after - 1), take(v, after)
             outputs.position[:, :, column] = hermite(f, span, take(p, after - 1), take(p, after), v0, v1)
             outputs.velocity[:, :, column] = v0 + f * (v1 - v0)
+
+
+@dataclass(frozen=True)
+class TorqueOffset(Effect):
+    """A torque sensor whose zero is off: a strain gauge that drifted, a current sensor's bias.
+
+    Sensor: the log shows tau + b; what moves the joint is tau.
+    """
+
+    name: ClassVar[str] = "torque_offset"
+    title: ClassVar[str] = "offset of the torque sensor"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("offset", "Nm", 0.0, -10.0, 10.0, 0.05),)
+    needs: ClassVar[str] = "effort"
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("constant_force", "a logged position of a joint that its command moves, or the drive switched off"),
+        ("com_offset", "several poses"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        peak = scale.counter_peak
+        return (Kind("offset", "Nm", 0.0, -peak, peak, 0.1 * scale.torque_rms),)
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        if outputs.effort is not None:
+            outputs.effort[:, :, batch.index.of(self.places)] += values[:, None, :, 0]
+
+
+@dataclass(frozen=True)
+class TorqueScale(Effect):
+    """A torque sensor whose scale is off: another torque constant, or an efficiency, than the log was written with.
+
+    Sensor: the log shows (1 + e) tau; what moves the joint is tau.
+    """
+
+    name: ClassVar[str] = "torque_scale"
+    title: ClassVar[str] = "error of the torque sensor's scale"
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("error", "1", 0.0, -0.5, 1.0, 0.02),)
+    needs: ClassVar[str] = "effort"
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("mass", "a weight that is known"),
+        ("torque_constant", "a logged position of a joint that its command moves"),
+    )
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        if outputs.effort is not None:
+            outputs.effort[:, :, batch.index.of(self.places)] *= 1 + values[:, None, :, 0]

@@ -98,10 +98,13 @@ class TermBench:
         study = make_study(robot, [log], numerics=NUMERICS, threads=1)
         return cls(study, log)
 
-    def predict(self, term: Term | None, *candidates: FloatArray, numerics: Numerics = NUMERICS) -> FloatArray:
-        """(m, samples, joints) positions under some values of a term, or of the plain model."""
+    def predict(
+        self, term: Term | None, *candidates: FloatArray, numerics: Numerics = NUMERICS, effort: bool = False
+    ) -> FloatArray:
+        """(m, samples, joints) positions, or torques of the servos, under values of a term, or of the plain model."""
         terms = () if term is None else (term,)
-        return Replay(self.study.robot, self.log, terms, numerics).predict(np.array(candidates)).position
+        outputs = Replay(self.study.robot, self.log, terms, numerics, effort).predict(np.array(candidates))
+        return outputs.position if outputs.effort is None else outputs.effort
 
     def forms(self, cls: type[Term]) -> Iterator[tuple[Term, FloatArray]]:
         """The term at all its places, in each of its two meanings, with the values of a clear case."""
@@ -126,6 +129,11 @@ def clear_case(cls: type[Term], scale: JointScale) -> FloatArray:
     if probes:
         return np.array(probes[-1][-1])
     return np.array([k.nominal + (5 if k.nominal + 5 * k.scale <= k.upper else -5) * k.scale for k in cls.sized(scale)])
+
+
+def shows_in_effort(cls: type[Term]) -> bool:
+    """Whether a term shows in torques and nothing else."""
+    return issubclass(cls, Effect) and cls.needs == "effort"
 
 
 def check_term(cls: type[Term], robot: Robot | None = None, log: Log | None = None) -> None:
@@ -183,16 +191,17 @@ def check_bounds(cls: type[Term], bench: TermBench) -> None:
 
 def check_neutral(cls: type[Term], bench: TermBench) -> None:
     """At its neutral value the model is the plain one, and away from it, it is not."""
-    plain = bench.predict(None, np.zeros(0))[0]
+    effort = shows_in_effort(cls)
+    plain = bench.predict(None, np.zeros(0), effort=effort)[0]
     for term, case in bench.forms(cls):
-        neutral, changed = bench.predict(term, term.neutral, case)
+        neutral, changed = bench.predict(term, term.neutral, case, effort=effort)
         change = np.abs(neutral - plain).max()
         exact = change <= EXACT
         if cls.structural:
             finer = replace(NUMERICS, timestep=NUMERICS.timestep / 2)
             still, held = (bench.predict(t, v, numerics=finer) for t, v in ((None, np.zeros(0)), (term, term.neutral)))
             exact = change <= NEARLY and np.abs(held - still).max() <= change / 2
-        require(exact, f"{term.called}: its neutral value changes the plain model by {change:.2g} rad or m")
+        require(exact, f"{term.called}: its neutral value changes the plain model by {change:.2g} rad, m or Nm")
         require(bool(np.isfinite(changed).all()), f"{term.called}: {case} has no finite replay")
         moved = np.abs(changed - neutral).max()
         if not term.absolute:
@@ -202,9 +211,10 @@ def check_neutral(cls: type[Term], bench: TermBench) -> None:
 def check_neighbours(cls: type[Term], bench: TermBench) -> None:
     """What a candidate gets does not depend on those beside it, to the last bit."""
     for term, case in bench.forms(cls):
-        beside = bench.predict(term, case, term.neutral, case)
+        effort = shows_in_effort(cls)
+        beside = bench.predict(term, case, term.neutral, case, effort=effort)
         for values, found in ((case, beside[0]), (term.neutral, beside[1]), (case, beside[2])):
-            same = np.array_equal(bench.predict(term, values)[0], found)
+            same = np.array_equal(bench.predict(term, values, effort=effort)[0], found)
             require(same, f"{term.called}: {values} moves otherwise beside another candidate")
 
 
@@ -216,8 +226,12 @@ def check_shared(cls: type[Term], bench: TermBench) -> None:
     apart, together = cls.at(places, scales), cls.at(places, scales, shared=True)
     case = clear_case(cls, scale_at(scales, places[0]))
     require(len(apart.parameters) == len(places) * len(together.parameters), f"{cls.name}: one amount is not shared")
-    one, each = bench.predict(together, case)[0], bench.predict(apart, np.tile(case, len(places)))[0]
-    require(bool(np.abs(one - each).max() <= EXACT), f"{cls.name}: one amount for all is not that amount at each")
+    effort = shows_in_effort(cls)
+    one, each = (
+        bench.predict(together, case, effort=effort),
+        bench.predict(apart, np.tile(case, len(places)), effort=effort),
+    )
+    require(bool(np.abs(one[0] - each[0]).max() <= EXACT), f"{cls.name}: one amount for all is not that amount at each")
 
 
 def check_written(cls: type[Term], bench: TermBench) -> None:
