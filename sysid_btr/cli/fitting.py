@@ -92,6 +92,7 @@ class Run:
 
     def study(self, executor: Executor) -> Study:
         """Logs and model laid out; remarks on the logs go to stderr."""
+        from sysid_btr.identify.mode import Mode
         from sysid_btr.identify.study import make_study
         from sysid_btr.objectives.targets import FITTED
 
@@ -102,6 +103,7 @@ class Run:
             holdout=read_holdout(self.options.holdout),
             channels=self.options.channels or FITTED,
             simulator=self.options.simulator,
+            mode=Mode(self.options.mode),
             threads=self.options.threads,
             executor=executor,
         )

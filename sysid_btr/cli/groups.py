@@ -57,7 +57,21 @@ class ParamsOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyOptions(ModelOptions, LogOptions, ParameterOptions, ParamsOptions):
+class ModeOptions(Options):
+    """How logs are compared with the model."""
+
+    mode: str = option(
+        "auto",
+        "How logs are compared: forward drives the model by their commands, inverse compares the torques that "
+        "the motion takes.",
+        otherwise="auto: inverse where no command is logged",
+        metavar="auto|forward|inverse",
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions(ModelOptions, LogOptions, ParameterOptions, ParamsOptions, ModeOptions):
     """What is fitted to what: shared by `fit`, `posterior` and `close`."""
 
     holdout: Holdout = option(

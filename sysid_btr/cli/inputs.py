@@ -86,7 +86,8 @@ def warn_of(robot: Robot, logs: Iterable[Log]) -> None:
 
     for log in logs:
         for problem in validate_log(log, joints=joint_names(robot), ranges=joint_ranges(robot)):
-            remark(f"warning: {log.path}: {problem.where}: {problem.message} [{problem.code}]\n    -> {problem.remedy}")
+            told = f"{log.path}: {problem.where}: {problem.message} [{problem.code}]\n    -> {problem.remedy}"
+            remark(f"{problem.severity}: {told}")
 
 
 def check_channels(names: Sequence[str]) -> None:

@@ -41,7 +41,7 @@ def validate(options: ValidateOptions) -> int:
         out = console(sys.stdout)
         for path, problems in found.items():
             errors = len(errors_of(problems))
-            warnings = len(problems) - errors
+            warnings = sum(problem.severity == "warning" for problem in problems)
             out.print(f"{path}: {_count(errors, 'error')}, {_count(warnings, 'warning')}")
             if problems:
                 out.print(problems_table(problems))

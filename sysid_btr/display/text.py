@@ -87,9 +87,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield Text(result["termination"], style="bold")
     for missing in result.get("not_drawn", []):
         yield Text(f"could not be drawn: {missing}", style="bold")
-    for walk in result.get("walks", []):
-        if walk["part"] == "train":
-            yield Text("; ".join(walk_words(walk)), style="dim")
+    yield from (Text(words, style="dim") for words in episode_words(result))
     numerics, model = result["numerics"], result["model"]["name"]
     yield Text(
         f"model {model}, {numerics['chosen']}; {result['replays']} replays in {result['wall_s']:.1f} s"
@@ -98,7 +96,17 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     )
 
 
-def walk_words(walk: Mapping[str, Any]) -> Iterator[str]:
+def episode_words(result: Mapping[str, Any]) -> Iterator[str]:
+    """How each fitted log was compared with the model, where that is not by one replay of all of it."""
+    for walk in result.get("walks", []):
+        if walk["part"] == "train":
+            yield "; ".join(_walk_words(walk))
+    for episode in result.get("episodes", []):
+        if episode["part"] == "train":
+            yield episode["summary"] + (f" ({episode['why']})" if episode["why"] else "")
+
+
+def _walk_words(walk: Mapping[str, Any]) -> Iterator[str]:
     """What was done with a floating-base log."""
     yield f"floating base: {walk['windows']} segments of {walk['window']:.2g} s fitted, each from an estimated state"
     if walk["counted_less"]:

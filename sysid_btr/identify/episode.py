@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -28,7 +27,7 @@ from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target, make_targets
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.model import Terms
 
 E = TypeVar("E", bound=ResidualEstimator)
@@ -139,11 +138,13 @@ class Episode(ABC):
     robot : the model, before what the log's metadata say about it.
     recording : all of the episode.
     scored : (n,) samples that count: those that are fitted, or those that are held out.
+    why : why it is compared with a model in this way, where that is not what is usually done.
     """
 
     robot: Robot
     recording: Log
     scored: BoolArray
+    why: str = field(default="", kw_only=True)
 
     warm_up: ClassVar[float] = 0.0
     """s after its beginning that are not scored."""
@@ -209,6 +210,11 @@ class Episode(ABC):
         """The same with other samples that count."""
         return replace(self, scored=scored)
 
+    def torque_at_hand(self, outputs: Outputs) -> FloatArray:
+        """Torques (n, j) by which sizes are judged: those of the servos in a replay of the plain model."""
+        assert outputs.effort is not None
+        return np.asarray(outputs.effort[0])
+
     def shortened(self, seconds: float) -> Self:
         """So many seconds of it at most."""
         time = self.log.time
@@ -268,32 +274,3 @@ class FixedEpisode(Episode):
 
     def replay(self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0) -> Replay:
         return Replay(self.robot.for_log(self.log), self.log, tuple(terms), numerics, effort, threads)
-
-
-def episode_of(robot: Robot, log: Log, threads: int = 0) -> Episode:
-    """All of a recording as an episode of the kind that its mount asks for."""
-    made: Episode = _kind(log).whole(robot, log, threads)
-    return made
-
-
-def split_episode(robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[Episode, Episode]:
-    """A recording whose last fraction is held out: what is fitted, and what is held out.
-
-    Raises
-    ------
-    UsageError
-        If the held-out fraction is not between 0 and 1.
-    LogError
-        If a part would be too short, or the base cannot be reconstructed.
-    """
-    made: tuple[Episode, Episode] = _kind(log).split(robot, log, holdout, threads)
-    return made
-
-
-KINDS = {"fixed": "sysid_btr.identify.episode:FixedEpisode", "free": "sysid_btr.floating_base.episode:FloatingEpisode"}
-"""Mount of a log -> its kind of episode. By name: floating bases are a wing above this one."""
-
-
-def _kind(log: Log) -> Any:
-    module, _, name = KINDS[log.meta.mount].partition(":")
-    return getattr(import_module(module), name)

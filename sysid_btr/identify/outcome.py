@@ -93,7 +93,7 @@ def replay_result(
 
 
 def _provenance(study: Study) -> dict[str, Any]:
-    walks, simulator = _walks(study), study.numerics.simulator
+    walks, episodes, simulator = _facts(study, "free"), _facts(study, "fixed"), study.numerics.simulator
     return {
         "units": channel_units(study.robot),
         "numerics": {
@@ -105,19 +105,20 @@ def _provenance(study: Study) -> dict[str, Any]:
         },
         "channels": study.channels,
         **({"walks": walks} if walks else {}),
+        **({"episodes": episodes} if episodes else {}),
         "versions": versions(),
         "logs": _logs(study),
         "model": study.robot.to_dict(),
     }
 
 
-def _walks(study: Study) -> list[dict[str, Any]]:
-    """How each floating-base log was segmented, and what its base state lacks."""
+def _facts(study: Study, mount: str) -> list[dict[str, Any]]:
+    """How each log of a mount was segmented or otherwise prepared, and what its base state lacks."""
     return [
         {"path": None if episode.log.path is None else str(episode.log.path), "part": part, **facts}
         for part, episodes in (("train", study.train), ("holdout", study.holdout))
         for episode in episodes
-        if (facts := episode.facts()) is not None
+        if episode.log.meta.mount == mount and (facts := episode.facts()) is not None
     ]
 
 

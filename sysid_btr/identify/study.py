@@ -12,7 +12,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
-from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure, episode_of, split_episode
+from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
+from sysid_btr.identify.mode import AUTOMATIC, Mode, episode_of, split_episode
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import split_episodes
 from sysid_btr.models.robot import Robot
@@ -159,6 +160,7 @@ def make_study(
     channels: Sequence[str] = FITTED,
     numerics: Numerics | None = None,
     simulator: str | None = None,
+    mode: Mode = AUTOMATIC,
     threads: int = 0,
     executor: Executor = HERE,
 ) -> Study:
@@ -172,6 +174,7 @@ def make_study(
     channels : channels to fit, of ``position``, ``velocity``, ``effort``.
     numerics : integrator and step; None chooses by a convergence check on the log.
     simulator : what moves the model, by name; None is that of `numerics`, or the built-in one.
+    mode : how the logs are compared with the model.
     threads : worker threads, 0 for all cores.
     executor : where candidates are simulated: this process, or what `open_executor` gives.
 
@@ -180,20 +183,21 @@ def make_study(
     ModelError
         If a log and the model have nothing in common.
     UsageError
-        If a recording is given twice, the held-out fraction is not between 0 and 1, or there is no such simulator.
+        If a recording is given twice, the held-out fraction is not between 0 and 1, there is no such simulator, or a
+        log does not suit the mode.
     """
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):
         _refuse_repeats(recordings)
-        parts = [split_episode(robot, e, float(holdout), threads) for e in recordings]
+        parts = [split_episode(robot, e, float(holdout), mode, threads) for e in recordings]
         train, held = [fitted for fitted, _ in parts], [left for _, left in parts]
     else:
         judged = [e for log in holdout for e in split_episodes(log)]
         if holdout is not logs:
             _refuse_repeats((*recordings, *judged))
-        train = [episode_of(robot, e, threads) for e in recordings]
-        held = [episode_of(robot, e, threads) for e in judged]
+        train = [episode_of(robot, e, mode, threads) for e in recordings]
+        held = [episode_of(robot, e, mode, threads) for e in judged]
     study = Study(
         robot=robot,
         train=tuple(train),
@@ -234,9 +238,8 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
         log, replay = episode.log, episode.replay((), numerics, effort=True, threads=threads)
         outputs = replay.predict(np.zeros((1, 0)))
         joints = replay.index.joints
-        assert outputs.effort is not None
         skip = np.searchsorted(outputs.time, min(WARM_UP, 0.1 * outputs.time[-1]))
-        t, v, q = outputs.effort[0, skip:], outputs.velocity[0, skip:], outputs.position[0, skip:]
+        t, v, q = episode.torque_at_hand(outputs)[skip:], outputs.velocity[0, skip:], outputs.position[0, skip:]
         time = outputs.time[skip:]
         for joint, asked in _torque_asked(robot.for_log(log), log).items():
             measured.setdefault(joint, []).append(asked)

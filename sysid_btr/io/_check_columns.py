@@ -94,8 +94,9 @@ def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
             "`sysid-btr replay --model M --log FILE --out DIR`",
         )
         return
+    torques = dict.fromkeys((*log.joints("effort"), *_names_of(meant, "effort")))
     for channel, names, purpose in (
-        ("command", commands, "without it nothing says what the joints were commanded to do"),
+        ("command", commands or torques, "nothing says what the joints were commanded to do, or what torques they had"),
         ("position", positions, "without it a replay cannot be compared with anything"),
     ):
         if not names:
@@ -106,6 +107,14 @@ def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
                 f"the log has no {channel} column at all: {purpose}",
                 f"add `{channel}.<joint>` for each joint; the columns there are: {some(_all_columns(log), 12)}",
             )
+    if torques and not commands:
+        yield Problem(
+            "command.none",
+            "note",
+            "command.*",
+            "no command is logged: the measured torques are compared with those that the measured motion takes",
+            "nothing, if none was recorded; what limits, delays or gains of servos do cannot be found without it",
+        )
     if not commands or not positions:
         return
     only_command = [name for name in commands if name not in positions]

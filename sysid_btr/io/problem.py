@@ -15,8 +15,8 @@ class Problem:
     ----------
     code : str
         Stable name of the kind of problem, e.g. ``"time.duplicate"``.
-    severity : {"error", "warning"}
-        An error makes the log unusable as it is; a warning is worth knowing.
+    severity : {"error", "warning", "note"}
+        An error makes the log unusable as it is; a warning is worth looking into; a note says how the log is read.
     where : str
         Column, sample range or time.
     message : str
@@ -26,7 +26,7 @@ class Problem:
     """
 
     code: str
-    severity: Literal["error", "warning"]
+    severity: Literal["error", "warning", "note"]
     where: str
     message: str
     remedy: str

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.display.changes import model_lines
-from sysid_btr.display.text import compact, identifiability, number, stages, walk_words
+from sysid_btr.display.text import compact, episode_words, identifiability, number, stages
 from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         pictures=[(p, _data_uri(p.light), None if p.dark is None else _data_uri(p.dark)) for p in shown],
         left_out=left_out,
         changes=list(model_lines(result)),
-        walks=["; ".join(walk_words(w)) for w in result.get("walks", []) if w["part"] == "train"],
+        walks=list(episode_words(result)),
         raw=raw if len(raw) <= LARGEST_RAW else None,
     )
 

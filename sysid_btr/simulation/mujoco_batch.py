@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SEGMENT = 1024
 """Steps per rollout call; bounds the records that are held at once."""
-POSITION, ACCELERATION = 1, 3
+POSITION, VELOCITY, ACCELERATION = 1, 2, 3
 """Stages of MuJoCo's forward dynamics (mjtStage)."""
 
 

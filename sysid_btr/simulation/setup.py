@@ -112,9 +112,7 @@ def prepare(
         torque = term.applied_torque(batch, values, border_time)
         if torque is not None:
             applied = torque if applied is None else applied + torque
-    laws = [Law(term, values, _places(batch.index, term)) for term, values in pairs if type(term).overrides("law")]
-    # what a servo does comes before what depends on it
-    laws.sort(key=lambda law: law.term.law_acts == ("friction",))
+    laws = laws_of(batch.index, pairs)
     state = {name: np.zeros((batch.size, size)) for name, size in (("qpos", batch.model.nq), ("qvel", batch.model.nv))}
     state["qpos"][:] = batch.model.qpos0
     state["qpos"][:, batch.index.qpos], state["qvel"][:, batch.index.dof] = qpos, qvel
@@ -123,11 +121,18 @@ def prepare(
         {**state, **batch.state},
         command[:, lead:],
         applied,
-        tuple(laws),
+        laws,
         inputs() if laws else {},
         numerics.held_steps,
         effort,
     )
+
+
+def laws_of(index: JointAddresses, pairs: Values) -> tuple[Law, ...]:
+    """Terms that act at every step, in the order in which they do."""
+    laws = [Law(term, values, _places(index, term)) for term, values in pairs if type(term).overrides("law")]
+    # what a servo does comes before what depends on it
+    return tuple(sorted(laws, key=lambda law: law.term.law_acts == ("friction",)))
 
 
 def _places(index: JointAddresses, term: Term) -> IntArray:

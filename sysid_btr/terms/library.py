@@ -9,6 +9,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.plugins import installed, load_installed
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.contact import FootCompliance, FootFriction
+from sysid_btr.terms.coupling import DriveCoupling, DriveCouplingDifference
 from sysid_btr.terms.disturbance import (
     ConstantForce,
     DriveDisturbanceTrain,
@@ -64,6 +65,8 @@ BUILT_IN: tuple[type[Term], ...] = (
     Armature,
     CommandDelay,
     SensorDelay,
+    DriveCoupling,
+    DriveCouplingDifference,
     Backlash,
     BacklashMotor,
     JointCompliance,
