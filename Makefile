@@ -16,7 +16,7 @@ SOURCES := sysid_btr reference_simulator tests benchmarks sample_logs notebooks 
 demo: $(VENV)/installed
 	$(BIN)/sysid-btr demo
 
-test: dev lint types check notebooks
+test: dev lint types check
 
 # what takes less than two minutes on two cores
 quick: lint types
@@ -35,8 +35,9 @@ types: $(VENV)/installed-dev
 # each worker simulates on threads of its own: threads of BLAS beside them only wait for each other
 check quick notebooks: export OPENBLAS_NUM_THREADS := 1
 
+# the notebooks first, each is long: one at the end would leave the other worker without work
 check: $(VENV)/installed-dev
-	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest $(PYTEST_FLAGS) --nbmake notebooks tests
 
 notebooks: $(VENV)/installed-dev
 	$(BIN)/python -m pytest --nbmake -p no:warnings -q notebooks
