@@ -19,6 +19,7 @@ from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.mujoco_batch import POSITION, evaluate
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import CHUNK, Replay
+from sysid_btr.simulation.setup import as_ctrl
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import BatchModel, Fields, JointAddresses, Outputs, Term
 
@@ -100,8 +101,8 @@ class World(Replay):
         place, motion = index.base
         qpos[:, place : place + 7], qvel[:, motion : motion + 6] = outputs.base[0, :, :7], outputs.base[0, :, 7:]
         qpos[:, index.qpos], qvel[:, index.dof] = outputs.position[0], outputs.velocity[0]
-        driven = index.actuator >= 0
-        ctrl[:, index.actuator[driven]] = command[:, driven]
+        driven = np.flatnonzero(index.actuator >= 0)
+        ctrl[:, index.actuator[driven]] = as_ctrl(index, driven, command[:, driven])
         batch = self.batch(self._values(np.tile(values, (n, 1))), n)
         state = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl}
         data = evaluate(batch, state, ("sensordata",), threads=self.threads)["sensordata"]

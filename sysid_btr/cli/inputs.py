@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sysid_btr.cli.kinds import Holdout, Ranges
 from sysid_btr.cli.terminal import remark
-from sysid_btr.errors import LogError, UsageError
+from sysid_btr.errors import LogError, ModelError, UsageError
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
@@ -80,14 +80,27 @@ def read_holdout(given: Holdout) -> float | list[Log]:
 
 
 def warn_of(robot: Robot, logs: Iterable[Log]) -> None:
-    """Remarks of the validation on logs that can be used all the same."""
-    from sysid_btr.io.validation import validate_log
-    from sysid_btr.models.robot import joint_names, joint_ranges
+    """Say what the validation finds of logs for a robot.
 
+    Raises
+    ------
+    ModelError
+        If there are errors among it, with all of them: a log that was read has none of its own.
+    """
+    from sysid_btr.io.problem import errors_of, explain
+    from sysid_btr.models.log_checks import check_log
+
+    refused = []
     for log in logs:
-        for problem in validate_log(log, joints=joint_names(robot), ranges=joint_ranges(robot)):
-            told = f"{log.path}: {problem.where}: {problem.message} [{problem.code}]\n    -> {problem.remedy}"
-            remark(f"{problem.severity}: {told}")
+        problems = check_log(robot, log)
+        errors = errors_of(problems)
+        if errors:
+            refused.append(explain(log.path, errors))
+        for problem in problems[len(errors) :]:
+            told = f"{problem.where}: {problem.message} [{problem.code}]\n    -> {problem.remedy}"
+            remark(f"{problem.severity}: {log.path}: {told}")
+    if refused:
+        raise ModelError("\n".join(refused))
 
 
 def check_channels(names: Sequence[str]) -> None:
@@ -106,21 +119,17 @@ def check_freed(robot: Robot, fit: Sequence[str]) -> None:
 
 
 def _what_can_be_freed(robot: Robot) -> str:
-    from sysid_btr.models.robot import body_names, joint_names, servo_joints
+    from sysid_btr.terms.grammar import SCOPES
     from sysid_btr.terms.library import declarable
 
     fields: dict[str, list[str]] = {}
     for name, cls in declarable(robot.fields).items():
         fields.setdefault(cls(places=(), declared=name).location, []).append(name)
     lines = [f"no parameters to fit: give --fit FIELD:GLOB[,GLOB..][=shared], once or more. {robot.name} has"]
-    for scope, names in (
-        ("body", body_names(robot)),
-        ("joint", joint_names(robot)),
-        ("servo", servo_joints(robot)),
-        ("robot", ("robot",)),
-    ):
-        noun = {"body": "bodies", "joint": "joints", "servo": "joints with a servo", "robot": "the whole"}[scope]
-        lines.append(f"  {', '.join(fields.get(scope, []))}\n    of {noun}: {', '.join(names) or 'none'}")
+    for scope, noun in SCOPES.items():
+        names = robot.names(scope)
+        if names:
+            lines.append(f"  {', '.join(fields.get(scope, []))}\n    of a {noun}: {', '.join(names)}")
     lines.append("for example: --fit 'mass:*' --fit 'kp:*=shared'")
     return "\n".join(lines)
 

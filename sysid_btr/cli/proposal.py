@@ -17,7 +17,7 @@ from sysid_btr.cli.options import Option, options_of
 from sysid_btr.cli.study_file import toml
 from sysid_btr.errors import ModelError, UsageError
 from sysid_btr.io.log import CHANNELS, Log
-from sysid_btr.models.robot import Robot, joint_names, servo_actuators
+from sysid_btr.models.robot import Robot, joint_names, servo_drives
 from sysid_btr.mujoco_conventions import FREE, slides
 from sysid_btr.objectives.noise import NoiseFloor, noise_floor
 from sysid_btr.objectives.targets import COMPARED, FITTED
@@ -242,7 +242,7 @@ def _masses(model: mujoco.MjModel, moving: Sequence[str], free: bool) -> Iterato
 
 def _gains(model: mujoco.MjModel, moving: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Gains of the servos of joints that moved, as one factor each."""
-    servos = {model.joint(int(model.actuator_trnid[a, 0])).name: a for a in servo_actuators(model)}
+    servos = {drive.joint: drive.actuator for drive in servo_drives(model)}
     for field, column, what in (("kp", 1, "stiffness of the servos"), ("kv", 2, "damping of the servos")):
         own = [n for n, a in servos.items() if n in moving and model.actuator_biasprm[a, column] != 0]
         if not own:

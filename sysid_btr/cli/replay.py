@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sysid_btr.cli.groups import JsonOptions, LogOptions, ModelOptions, ParamsOptions, SimulatorOptions, ThreadOptions
-from sysid_btr.cli.inputs import find_robot, read_logs
+from sysid_btr.cli.inputs import find_robot, read_logs, warn_of
 from sysid_btr.cli.kinds import Numbers
 from sysid_btr.cli.options import option
 from sysid_btr.cli.terminal import print_json, remark
@@ -43,6 +43,7 @@ def replay(options: ReplayOptions) -> int:
     logs = read_logs(options.log, motions=True)
     model, numerics = _changed(robot, options)
     targets = _targets(options.out, logs, options.overwrite)
+    warn_of(robot, [one for one in logs if not one.is_motion])
     if any(one.is_motion for one in logs):
         _rehearse(robot, model, numerics, logs, targets, options)
     else:

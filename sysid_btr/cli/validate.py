@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from sysid_btr.cli.groups import JsonOptions, LogOptions, ModelOptions
+from sysid_btr.cli.inputs import find_robot
 from sysid_btr.cli.options import argument
 from sysid_btr.cli.terminal import print_json
 from sysid_btr.errors import LogError, UsageError
@@ -23,16 +26,13 @@ def validate(options: ValidateOptions) -> int:
     """Say everything that is wrong with a log, where, and what to do about it (exit 3 on errors)."""
     from sysid_btr.io.problem import errors_of
     from sysid_btr.io.validation import validate_file
-    from sysid_btr.models.builtin import load_robot
-    from sysid_btr.models.robot import joint_names, joint_ranges
+    from sysid_btr.models.log_checks import check_log
 
     paths = [*options.files, *options.log]
     if not paths:
         raise UsageError("which log? Give one or more files: sysid-btr validate walk.parquet")
-    robot = None if options.model is None else load_robot(options.model)
-    joints = None if robot is None else joint_names(robot)
-    ranges = None if robot is None else joint_ranges(robot)
-    found = {path: validate_file(path, joints=joints, ranges=ranges) for path in paths}
+    check = None if options.model is None else partial(check_log, find_robot(options.model))
+    found = {path: validate_file(path, check=check) for path in paths}
     if options.json:
         print_json({str(path): problems for path, problems in found.items()})
     else:
@@ -40,9 +40,10 @@ def validate(options: ValidateOptions) -> int:
 
         out = console(sys.stdout)
         for path, problems in found.items():
-            errors = len(errors_of(problems))
-            warnings = sum(problem.severity == "warning" for problem in problems)
-            out.print(f"{path}: {_count(errors, 'error')}, {_count(warnings, 'warning')}")
+            numbers = Counter(problem.severity for problem in problems)
+            counts = [_count(numbers[kind], kind) for kind in ("error", "warning")]
+            counts += [_count(numbers["note"], "note")] if numbers["note"] else []
+            out.print(f"{path}: {', '.join(counts)}")
             if problems:
                 out.print(problems_table(problems))
     return LogError.exit_code if any(errors_of(problems) for problems in found.values()) else 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter
+from typing import get_args
 
 import numpy as np
 
@@ -29,8 +30,9 @@ from sysid_btr.estimators.base import Progress
 from sysid_btr.estimators.journal import Record
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.refit import refit, robust_refit, shorten
-from sysid_btr.models.robot import body_names, joint_names, servo_joints
+from sysid_btr.models.robot import body_names, joint_names
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.base import Scope
 from sysid_btr.terms.effect import Effect
 
 Library = Sequence[type[Effect]]
@@ -152,12 +154,7 @@ def _perturbations(
 ) -> list[Perturbation]:
     """What a scan asks for: a term already at a location is not, as it is refitted with everything else."""
     study = state.study
-    places = {
-        "joint": joint_names(study.robot),
-        "servo": servo_joints(study.robot),
-        "body": body_names(study.robot),
-        "robot": ("robot",),
-    }
+    places: dict[str, tuple[str, ...]] = {scope: study.robot.names(scope) for scope in get_args(Scope)}
     asked: list[Perturbation] = perturbations(library, places, study.scales)
     if rules.alike:
         asked = [q for q in asked if len(q.places) > 1 or q.effect.scope == "robot"]

@@ -245,13 +245,14 @@ def find_motors(robot: Robot, motion: MotionSettings | None = None, reference: L
     """
     import mujoco
 
-    from sysid_btr.models.robot import joint_ranges, servo_actuators, servo_joints
+    from sysid_btr.models.robot import joint_ranges, servo_drives
 
     motion = motion or MotionSettings()
     if not 0 <= motion.margin < 0.5:
         raise UsageError(f"--margin {motion.margin:g}: a fraction of each joint's range, 0 to less than 0.5")
     model = robot.model
-    known = servo_joints(robot)
+    drives = {drive.joint: drive for drive in servo_drives(model)}
+    known = tuple(drives)
     if not known:
         raise ModelError(f"model {robot.name} has no position servo, so no joint can be commanded")
     chosen = _chosen(known, motion.joints)
@@ -261,7 +262,6 @@ def find_motors(robot: Robot, motion: MotionSettings | None = None, reference: L
     mujoco.mj_fullM(model, data, inertia)
     ranges = joint_ranges(robot)
     motors = []
-    actuators = {model.joint(int(model.actuator_trnid[a, 0])).name: a for a in servo_actuators(model)}
     done: set[str] = set()
     for name in chosen:
         if name in done:
@@ -271,11 +271,13 @@ def find_motors(robot: Robot, motion: MotionSettings | None = None, reference: L
         low, high, fast, sharp = -np.inf, np.inf, np.inf, np.inf
         home = float(model.qpos0[model.joint(name).qposadr[0]])
         for joint in together:
-            a, dof = actuators[joint], int(model.joint(joint).dofadr[0])
+            drive, dof = drives[joint], int(model.joint(joint).dofadr[0])
+            a = drive.actuator
             sliding = slides(model, joint)
             least, most = _room(joint, home, ranges, reference, motion.margin, sliding)
             if model.actuator_ctrllimited[a]:
-                least, most = max(least, model.actuator_ctrlrange[a, 0]), min(most, model.actuator_ctrlrange[a, 1])
+                reach = np.sort(model.actuator_ctrlrange[a] / drive.scale)
+                least, most = max(least, reach[0]), min(most, reach[1])
             low, high = max(low, least), min(high, most)
             fast = min(fast, VELOCITY[sliding] if motion.velocity is None else motion.velocity)
             sharp = min(sharp, ACCELERATION[sliding] if motion.acceleration is None else motion.acceleration)

@@ -28,7 +28,7 @@ from sysid_btr.objectives.covariance import Known, covariance
 from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
-from sysid_btr.simulation.grid import Grid, make_grid
+from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments
 from sysid_btr.simulation.silence import silenced
 
@@ -99,9 +99,9 @@ class SampleSteps(FloatingReplay):
 
     @cached_property
     def grid(self) -> Grid:
-        grid = make_grid(self.log, self.index.joints, self.start[0], self.numerics.timestep)
+        grid = super().grid
         rows = np.maximum(np.arange(grid.steps) - self.late, 0)
-        return replace(grid, command=grid.command[rows])
+        return replace(grid, command=grid.command[rows], extra=grid.extra[rows])
 
     @cached_property
     def feet(self) -> list[int]:

@@ -11,6 +11,7 @@ import numpy as np
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.split import split_episodes
+from sysid_btr.models.log_checks import require_drives
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.registry import on_simulator
 from sysid_btr.simulation.replay import Replay
@@ -52,9 +53,12 @@ def replay_log(
 
     Raises
     ------
+    ModelError
+        If a command drives nothing, or not what it says.
     UsageError
         A parameter that the model does not have, a value that is not finite, or an unknown simulator.
     """
+    require_drives(robot, [log])
     model = parameters if isinstance(parameters, Model) else set_parameters(robot, parameters or {})
     episodes = split_episodes(log)
     if numerics is None:

@@ -16,6 +16,8 @@ from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
 from sysid_btr.identify.mode import AUTOMATIC, Mode, episode_of, split_episode
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import split_episodes
+from sysid_btr.models.commands import commanded
+from sysid_btr.models.log_checks import require_drives
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
@@ -181,11 +183,12 @@ def make_study(
     Raises
     ------
     ModelError
-        If a log and the model have nothing in common.
+        If a log and the model have nothing in common, or a command drives nothing, or not what it says.
     UsageError
         If a recording is given twice, the held-out fraction is not between 0 and 1, there is no such simulator, or a
         log does not suit the mode.
     """
+    require_drives(robot, logs)
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):
@@ -277,11 +280,12 @@ def _torque_asked(robot: Robot, log: Log) -> dict[str, FloatArray]:
     index = make_index(model)
     driven = [j for j, a in zip(index.joints, index.actuator, strict=True) if a >= 0]
     blank = np.full(len(log), np.nan)
+    given = commanded(log, model)
     command, position = (
-        np.column_stack([log.channels.get(f"{channel}.{j}", blank) for j in index.joints])[None]
+        np.column_stack([given.channels.get(f"{channel}.{j}", blank) for j in index.joints])[None]
         for channel in ("command", "position")
     )
     law = ServoLaw.of(BatchModel(model, index, model.opt.timestep, 1))
     torque = law.torque(command, position, np.zeros(position.shape))[0]
-    found = {j: torque[:, index.joints.index(j)] for j in driven if log.has("position", j) and log.has("command", j)}
+    found = {j: torque[:, index.joints.index(j)] for j in driven if log.has("position", j) and given.has("command", j)}
     return {joint: column[np.isfinite(column)] for joint, column in found.items()}

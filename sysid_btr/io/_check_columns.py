@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
 
 from sysid_btr.io._text import mirrored, some
 from sysid_btr.io.log import CHANNELS, IMU_NAMES, JOINT_CHANNELS, Log, closest
 from sysid_btr.io.problem import Problem
 
+MOVERS = ("command_velocity", "command_effort", "effort", "current")
+"""Channels that say what moved a joint where no command does."""
 
-def check_columns(log: Log, joints: Sequence[str] | None) -> Iterator[Problem]:
-    """Names of columns: misspelled, of no channel, without their partner, missing or unknown to the model."""
+
+def check_columns(
+    log: Log, joints: Sequence[str] | None, drives: Mapping[str, str] | None = None, controls: Sequence[str] = ()
+) -> Iterator[Problem]:
+    """Names of columns: misspelled, of no channel, without their partner, missing or unknown to the model.
+
+    `drives` has the joints that the model drives, where it is known, and `controls` its actuators of other things.
+    """
     misspelled = _misspelled(log, joints or ())
     for column, meant in misspelled.items():
         yield Problem(
@@ -21,9 +31,9 @@ def check_columns(log: Log, joints: Sequence[str] | None) -> Iterator[Problem]:
             f"rename {column} to {meant}; if it is something else, choose a name that differs more",
         )
     yield from _strange_channels(log, misspelled)
-    yield from _pairs(log, misspelled)
+    yield from _pairs(log, misspelled, drives, controls)
     if joints is not None:
-        yield from _against_model(log, joints, misspelled)
+        yield from _against_model(log, joints, misspelled, controls)
 
 
 def log_joints(log: Log) -> tuple[str, ...]:
@@ -79,7 +89,9 @@ def _strange_channels(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]
         )
 
 
-def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
+def _pairs(
+    log: Log, misspelled: dict[str, str], drives: Mapping[str, str] | None, controls: Sequence[str]
+) -> Iterator[Problem]:
     meant = set(misspelled.values())
     commands = dict.fromkeys((*log.joints("command"), *_names_of(meant, "command")))
     positions = dict.fromkeys((*log.joints("position"), *_names_of(meant, "position")))
@@ -94,9 +106,11 @@ def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
             "`sysid-btr replay --model M --log FILE --out DIR`",
         )
         return
-    torques = dict.fromkeys((*log.joints("effort"), *_names_of(meant, "effort")))
+    torques = dict.fromkeys((*(j for c in MOVERS for j in log.joints(c)), *_names_of(meant, "effort")))
+    switches = [log.channels[f"enabled.{joint}"] for joint in log.joints("enabled")]
+    moved = bool(torques) or log.meta.drive == "none" or (bool(switches) and not np.any(switches))
     for channel, names, purpose in (
-        ("command", commands or torques, "nothing says what the joints were commanded to do, or what torques they had"),
+        ("command", commands or moved, "nothing says what the joints were commanded to do, or what torques they had"),
         ("position", positions, "without it a replay cannot be compared with anything"),
     ):
         if not names:
@@ -117,8 +131,9 @@ def _pairs(log: Log, misspelled: dict[str, str]) -> Iterator[Problem]:
         )
     if not commands or not positions:
         return
-    only_command = [name for name in commands if name not in positions]
-    only_position = [name for name in positions if name not in commands]
+    only_command = [name for name in commands if name not in positions and name not in controls]
+    unknown = [name for name in positions if name not in commands and name not in torques]
+    only_position = [name for name in unknown if drives is None or name in drives]
     for name in list(only_position):
         twin = closest(name, only_command, cutoff=0.8)
         if twin is not None and not mirrored(name, twin):
@@ -157,12 +172,14 @@ def _all_columns(log: Log) -> list[str]:
     return [*log.channels, *log.unknown] or ["none"]
 
 
-def _against_model(log: Log, joints: Sequence[str], misspelled: dict[str, str]) -> Iterator[Problem]:
+def _against_model(
+    log: Log, joints: Sequence[str], misspelled: dict[str, str], controls: Sequence[str]
+) -> Iterator[Problem]:
     there = log_joints(log)
     meant = {column.partition(".")[2] for column in misspelled.values()}
     usable = {*log.joints("command"), *log.joints("position"), *meant}
     missing = [name for name in joints if name not in usable]
-    unknown = [name for name in there if name not in joints]
+    unknown = [name for name in there if name not in joints and name not in controls]
     for name in list(unknown):
         guess = closest(name, missing, cutoff=0.8)
         if guess is not None and not mirrored(name, guess):
@@ -175,15 +192,23 @@ def _against_model(log: Log, joints: Sequence[str], misspelled: dict[str, str]) 
                 f"the model has no joint {name}, and the log has nothing for {guess}: did you mean {guess}?",
                 f"rename the columns of {name} to {guess}; joints are matched by name, exactly",
             )
-    if missing:
+    if missing and len(missing) == len(joints):
         yield Problem(
             "joint.missing",
             "error",
             some(missing),
-            f"the model has {'these joints' if len(missing) > 1 else 'this joint'}, "
-            "the log has neither command nor position for them; "
+            "the log has neither command nor position for any joint of the model; "
             f"its joints: {some(there, 12) or 'none'}",
-            "log these joints too, or use a model in which they are fixed",
+            "give the model of this robot, or rename the columns",
+        )
+    elif missing:
+        yield Problem(
+            "joint.unlogged",
+            "note",
+            some(missing),
+            "these joints of the model are not logged: they start where the keyframe, --at or the metadata say, at "
+            "zero otherwise, and move with what couples them to others",
+            "nothing, if they are passive, coupled or idle; else log them too",
         )
     if unknown:
         yield Problem(

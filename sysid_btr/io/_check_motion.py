@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -25,8 +25,12 @@ def _threshold(log: Log, joint: str) -> float:
     return _MOVES_M if is_linear(log, joint) else _MOVES_RAD
 
 
-def check_motion(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
-    """Problems that show in command and position together, and channels that say nothing."""
+def check_motion(log: Log, tracking: Mapping[str, Tracking], kinds: Mapping[str, str]) -> Iterator[Problem]:
+    """Problems that show in command and position together, and channels that say nothing.
+
+    A position follows a command of position; a torque or a speed of zero for a whole log is nothing to wonder at.
+    """
+    positions = [joint for joint, kind in kinds.items() if kind == "position"]
     swapped = _swapped(log, tracking)
     if swapped:
         pairs = some([f"{left} and {right}" for left, right in swapped])
@@ -47,9 +51,9 @@ def check_motion(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem
             "the position moves opposite to the command: one of the two has the wrong sign",
             "negate the column that does not follow the model's joint axis",
         )
-    yield from _stuck(log)
+    yield from _stuck(log, positions)
     yield from _late(log, {j: t for j, t in tracking.items() if j not in explained and j not in flipped})
-    yield from _dead(log)
+    yield from _dead(log, positions)
     yield from _clipped_sensors(log)
 
 
@@ -184,11 +188,11 @@ def _speeds_through(velocity: FloatArray, log: Log, values: FloatArray, start: i
     return spread(covered) > 0.1 * spread(values)
 
 
-def _stuck(log: Log) -> Iterator[Problem]:
+def _stuck(log: Log, joints: Sequence[str]) -> Iterator[Problem]:
     dead: list[str] = []
     partly: dict[str, str] = {}
     pinned: dict[str, str] = {}
-    for joint in log.joints("command"):
+    for joint in joints:
         column = f"position.{joint}"
         if column not in log.channels:
             continue
@@ -251,7 +255,7 @@ def _travel(log: Log, joint: str) -> float:
     return 0.0 if position is None else spread(position[driven(log, joint)])
 
 
-def _dead(log: Log) -> Iterator[Problem]:
+def _dead(log: Log, joints: Sequence[str]) -> Iterator[Problem]:
     silent: list[str] = []
     unmoved: list[str] = []
     forces_vary = any(spread(log.channels[f"force.{site}"]) > 0 for site in log.joints("force"))
@@ -264,7 +268,7 @@ def _dead(log: Log) -> Iterator[Problem]:
                 silent.append(column)
         elif (channel == "imu" and log.meta.mount == "free") or (channel == "force" and forces_vary):
             silent.append(column)
-        elif channel == "command" and _travel(log, name) > 15 * _threshold(log, name):
+        elif channel == "command" and name in joints and _travel(log, name) > 15 * _threshold(log, name):
             unmoved.append(name)
     if silent:
         yield Problem(

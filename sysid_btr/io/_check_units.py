@@ -19,6 +19,8 @@ DEGREES = 180 / math.pi
 _ALLOWED: Mapping[str, tuple[str, ...]] = {
     "time": ("s", "sec", "second", "seconds"),
     "command": ("rad", "radian", "radians", "m", "metre", "meter", "1", "A", "V", "Nm", "N", "rad/s", "m/s"),
+    "command_velocity": ("rad/s", "m/s"),
+    "command_effort": ("Nm", "N"),
     "position": ("rad", "radian", "radians", "m", "metre", "meter"),
     "velocity": ("rad/s", "rads-1", "radian/s", "m/s", "ms-1"),
     "effort": ("Nm", "N"),
@@ -136,11 +138,15 @@ def _peak(values: FloatArray) -> float:
 
 
 def check_scale(
-    log: Log, tracking: Mapping[str, Tracking], ranges: Mapping[str, tuple[float, float]] | None
+    log: Log,
+    tracking: Mapping[str, Tracking],
+    ranges: Mapping[str, tuple[float, float]] | None,
+    kinds: Mapping[str, str],
 ) -> Iterator[Problem]:
     """Degrees for radians, millimetres for metres, g for m/s^2, and ranges that do not fit."""
-    degrees = _degrees_by_magnitude(log, ranges or {})
+    degrees = _degrees_by_magnitude(log, ranges or {}, kinds)
     milli: dict[str, str] = {}
+    shrunk: dict[str, str] = {}
     odd: dict[str, float] = {}
     for joint, pair in tracking.items():
         slope = pair.slope
@@ -150,7 +156,10 @@ def check_scale(
         larger, smaller = ("position", "command") if abs(slope) > 1 else ("command", "position")
         reason = f"{larger}.{joint} moves {factor:.0f} times as far as {smaller}.{joint}"
         if not is_linear(log, joint) and 0.6 * DEGREES < factor < 1.6 * DEGREES:
-            degrees.setdefault(f"{larger}.{joint}", reason)
+            if _fits(log, f"{larger}.{joint}", joint, ranges or {}):
+                shrunk[f"{smaller}.{joint}"] = reason
+            else:
+                degrees.setdefault(f"{larger}.{joint}", reason)
         elif is_linear(log, joint) and 600 < factor < 1600:
             milli[f"{larger}.{joint}"] = reason
         elif factor > 20:
@@ -166,6 +175,15 @@ def check_scale(
             f"{'these values look' if len(degrees) > 1 else 'the values look'} like degrees, not radians: {example}",
             f"multiply by pi/180 (check every joint of the channel); a joint that really turns so far: "
             f'set "units": {{"{column}": "rad"}} in the metadata',
+        )
+    if shrunk:
+        yield Problem(
+            "units.degrees_twice",
+            "error",
+            by_channel(list(shrunk)),
+            "the values look as if degrees had been converted to radians twice: "
+            f"{next(iter(shrunk.values()))}, and that fits the joint's range in the model",
+            "multiply by 180/pi",
         )
     if milli:
         yield Problem(
@@ -189,12 +207,14 @@ def check_scale(
     yield from _acceleration_in_g(log)
 
 
-def _degrees_by_magnitude(log: Log, ranges: Mapping[str, tuple[float, float]]) -> dict[str, str]:
+def _degrees_by_magnitude(
+    log: Log, ranges: Mapping[str, tuple[float, float]], kinds: Mapping[str, str]
+) -> dict[str, str]:
     found: dict[str, str] = {}
     for channel in ("command", "position"):
         for joint in log.joints(channel):
             column = f"{channel}.{joint}"
-            if _not_radians(log, column):
+            if _not_radians(log, column) or (channel == "command" and kinds.get(joint) != "position"):
                 continue
             peak = _peak(log.channels[column])
             limit = 2 * math.pi
@@ -202,7 +222,11 @@ def _degrees_by_magnitude(log: Log, ranges: Mapping[str, tuple[float, float]]) -
             if joint in ranges:
                 limit = 1.5 * max(abs(ranges[joint][0]), abs(ranges[joint][1]), 0.1)
                 known = f"the joint's range is {ranges[joint][0]:.3g} to {ranges[joint][1]:.3g} rad"
-            # Degrees put back into radians must fit; something wilder is left to the range check.
+            # Degrees put back into radians must fit; something wilder is left to the range check. A command beside a
+            # position that is plausible in radians is no angle, unless the two go together, which is checked too.
+            beside = log.channels.get(f"position.{joint}") if channel == "command" else None
+            if beside is not None and 0 < _peak(beside) <= limit:
+                continue
             if peak > limit and (joint not in ranges or peak / DEGREES <= limit):
                 found[column] = f"{column} reaches {peak:.4g}, and {known}"
     for axis in ("angle_x", "angle_y"):
@@ -212,6 +236,17 @@ def _degrees_by_magnitude(log: Log, ranges: Mapping[str, tuple[float, float]]) -
             if peak > 2 * math.pi:
                 found[column] = f"{column} reaches {peak:.4g}, and one turn is 6.28 rad"
     return found
+
+
+def _fits(log: Log, column: str, joint: str, ranges: Mapping[str, tuple[float, float]]) -> bool:
+    """Whether the model says where a joint may be, and a column that is moved as far stays there."""
+    if joint not in ranges:
+        return False
+    values = log.channels[column]
+    values = values[np.isfinite(values)]
+    low, high = ranges[joint]
+    margin = 0.05 * (high - low)
+    return bool(np.all((values > low - margin) & (values < high + margin)))
 
 
 def _rate_ratio(log: Log, position: str, rate: str) -> float | None:

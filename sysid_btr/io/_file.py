@@ -18,6 +18,7 @@ from sysid_btr.io.problem import Problem
 if TYPE_CHECKING:
     import pyarrow as pa
 
+DRIVES = ("position", "velocity", "torque", "mixed", "none")
 METADATA_KEY = b"sysid_btr"
 _MAGIC = b"PAR1"
 TEXT, UNKNOWN = "a text or CSV file", "something else"
@@ -206,6 +207,19 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
         accept(key, value is None or _positive(value), "a positive number of seconds")
         if known.get(key) is not None:
             known[key] = float(known[key])
+    accept("drive", raw.get("drive") in DRIVES, ", ".join(f'"{name}"' for name in DRIVES))
+    accept("command_space", raw.get("command_space") in ("joint", "ctrl"), '"joint" or "ctrl"')
+    constant, at = raw.get("torque_constant"), raw.get("at")
+    accept(
+        "torque_constant",
+        _positive(constant) or _numbers(constant),
+        'Nm/A as a number, or by joint, e.g. {"elbow": 0.09}',
+    )
+    accept(
+        "at",
+        _numbers(at) or (isinstance(at, str) and at.startswith("keyframe:")),
+        'positions by joint, e.g. {"finger": 0.02}, or "keyframe:NAME"',
+    )
     units = raw.get("units")
     accept(
         "units",
@@ -226,6 +240,13 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
                 )
             )
     return LogMeta(**known, extra=extra)
+
+
+def _numbers(value: object) -> bool:
+    """Whether it is a table of finite numbers."""
+    return isinstance(value, dict) and all(
+        isinstance(n, (int, float)) and not isinstance(n, bool) and math.isfinite(n) for n in value.values()
+    )
 
 
 def _positive(value: object) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,8 +73,21 @@ def best_lag(pair: Tracking, low: float, high: float, other: Tracking | None = N
     return max(found, key=lambda entry: abs(entry[1]))
 
 
-def trackings(log: Log) -> Mapping[str, Tracking]:
-    """Joints that have both command and position, on a regular clock of at most 100 Hz."""
+_KINDS = {"Nm": "torque", "N": "torque", "rad/s": "velocity", "m/s": "velocity"}
+"""Units of commands that are no positions."""
+
+
+def command_kinds(log: Log, drives: Mapping[str, str]) -> dict[str, str]:
+    """What each commanded joint's command is: to the model's drives, by its unit, by the log's account, a position."""
+    told = log.meta.drive if log.meta.drive in ("velocity", "torque") else "position"
+    return {
+        joint: drives.get(joint) or _KINDS.get(log.meta.unit(f"command.{joint}") or "", told)
+        for joint in log.joints("command")
+    }
+
+
+def trackings(log: Log, joints: Sequence[str]) -> Mapping[str, Tracking]:
+    """Those joints that have both command and position, on a regular clock of at most 100 Hz."""
     interval = typical_interval(log.time[np.isfinite(log.time)])
     if not np.isfinite(interval) or len(log) < _MIN_SAMPLES:
         return {}
@@ -84,7 +97,7 @@ def trackings(log: Log) -> Mapping[str, Tracking]:
     nearest = np.clip(np.searchsorted(time, grid + 0.5 * interval) - 1, 0, len(time) - 1)
     near = np.abs(time[nearest] - grid) <= step
     found: dict[str, Tracking] = {}
-    for joint in log.joints("command"):
+    for joint in joints:
         if not log.has("position", joint):
             continue
         command = log.channels[f"command.{joint}"]

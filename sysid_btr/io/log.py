@@ -22,6 +22,8 @@ SCHEMA_VERSION = 1
 
 JOINT_CHANNELS = (
     "command",
+    "command_velocity",
+    "command_effort",
     "position",
     "velocity",
     "effort",
@@ -66,6 +68,14 @@ class LogMeta:
         Period of the servo's control law, s.
     units : mapping of str to str
         Unit by channel (``"position"``) or by column (``"position.slider"``); SI where silent.
+    drive : {"", "position", "velocity", "torque", "mixed", "none"}
+        What commands are; as the model's actuators say where it is silent. "none": they drive nothing.
+    command_space : {"joint", "ctrl"}
+        Whether ``command.<joint>`` is in units of the joint, or MuJoCo's ctrl.
+    torque_constant : float or mapping of str to float
+        Torque per ampere, Nm/A (N/A), of all joints or by joint: makes torques of logged currents.
+    at : mapping of str to float, or str
+        Where joints stand that are not logged, rad or m by joint, or ``"keyframe:NAME"`` of the model.
     notes : str
         Free text.
     extra : mapping
@@ -80,6 +90,10 @@ class LogMeta:
     command_hold: Literal["zoh", "linear"] = "zoh"
     servo_period: float | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    drive: str = ""
+    command_space: Literal["joint", "ctrl"] = "joint"
+    torque_constant: float | Mapping[str, float] | None = None
+    at: Mapping[str, float] | str = ""
     notes: str = ""
     extra: Mapping[str, Any] = field(default_factory=dict)
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import secrets
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -132,8 +133,9 @@ def meta_to_json(meta: LogMeta) -> dict[str, Any]:
         for f in fields(LogMeta)
         if f.name != "extra" and (f.name in _ALWAYS_WRITTEN or getattr(meta, f.name) != getattr(default, f.name))
     }
-    if "units" in known:
-        known["units"] = dict(meta.units)
+    for name, value in known.items():
+        if isinstance(value, Mapping):
+            known[name] = dict(value)
     return {**known, **{key: value for key, value in meta.extra.items() if key not in known}}
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
+
+Severity = Literal["error", "warning", "note"]
 
 
 @dataclass(frozen=True)
@@ -26,13 +28,18 @@ class Problem:
     """
 
     code: str
-    severity: Literal["error", "warning", "note"]
+    severity: Severity
     where: str
     message: str
     remedy: str
 
     def __str__(self) -> str:
         return f"{self.severity} [{self.code}] {self.where}: {self.message}\n    -> {self.remedy}"
+
+
+def worst_first(problems: Sequence[Problem]) -> tuple[Problem, ...]:
+    """Errors, then warnings, then notes, each in the order in which they were found."""
+    return tuple(sorted(problems, key=lambda problem: get_args(Severity).index(problem.severity)))
 
 
 def errors_of(problems: Sequence[Problem]) -> tuple[Problem, ...]:

@@ -65,7 +65,7 @@ def resample(log: Log, period: float) -> Log:
     )
 
 
-def command_at(log: Log, names: Sequence[str], times: FloatArray) -> FloatArray:
+def command_at(log: Log, names: Sequence[str], times: FloatArray, channel: str = "command") -> FloatArray:
     """The command each joint was under at arbitrary times.
 
     Parameters
@@ -76,6 +76,8 @@ def command_at(log: Log, names: Sequence[str], times: FloatArray) -> FloatArray:
         Joints.
     times : ndarray, shape (m,)
         Times on the log's own clock, s, in any order.
+    channel : str
+        Another channel of commands.
 
     Returns
     -------
@@ -92,7 +94,7 @@ def command_at(log: Log, names: Sequence[str], times: FloatArray) -> FloatArray:
         If one of `times` is not finite.
     """
     times = np.asarray(times, dtype=np.float64)
-    commands = log.array("command", names)
+    commands = log.array(channel, names)
     _require_increasing(log, across_episodes=True)
     if len(times) and not np.all(np.isfinite(times)):
         raise UsageError("commands were requested at a time that is not a finite number")
@@ -173,7 +175,7 @@ def _at(log: Log, column: str, grid: FloatArray, held: IntArray, in_gap: BoolArr
     time, values = log.time, log.channels[column]
     channel = column.partition(".")[0]
     at_sample = values[held]
-    holds = channel in _SET_CHANNELS or (channel == "command" and log.meta.command_hold == "zoh")
+    holds = channel in _SET_CHANNELS or (channel.startswith("command") and log.meta.command_hold == "zoh")
     if holds or len(time) < 2:
         return np.where(in_gap, np.nan, at_sample)
     # Interpolation knows no snapping, except where it would lose a sample to a NaN beside it.

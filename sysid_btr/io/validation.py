@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from sysid_btr.io._check_clock import check_clock
@@ -12,15 +12,20 @@ from sysid_btr.io._check_motion import check_motion
 from sysid_btr.io._check_units import check_declared_units, check_scale
 from sysid_btr.io._check_values import check_values, plausible
 from sysid_btr.io._file import load
-from sysid_btr.io._tracking import trackings
+from sysid_btr.io._tracking import command_kinds, trackings
 from sysid_btr.io.log import Log
-from sysid_btr.io.problem import Problem
+from sysid_btr.io.problem import Problem, worst_first
 
 __all__ = ["Problem", "validate_file", "validate_log"]
 
 
 def validate_log(
-    log: Log, *, joints: Sequence[str] | None = None, ranges: Mapping[str, tuple[float, float]] | None = None
+    log: Log,
+    *,
+    joints: Sequence[str] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    drives: Mapping[str, str] | None = None,
+    controls: Sequence[str] = (),
 ) -> tuple[Problem, ...]:
     """Problems of a log's content.
 
@@ -35,6 +40,10 @@ def validate_log(
         Joints of the model: the log must have them, and those it has besides are pointed out.
     ranges : mapping of str to (low, high), optional
         Range of each joint where known, rad or m.
+    drives : mapping of str to {"position", "velocity", "torque"}, optional
+        What a command of a joint is to the model; without it, what the log's metadata say, else a position.
+    controls : sequence of str
+        Actuators of the model that are commanded by their own name.
 
     Returns
     -------
@@ -44,16 +53,17 @@ def validate_log(
     if len(log) == 0:
         return (Problem("log.empty", "error", "time", "the log has no samples", "record some seconds of motion"),)
     motion = plausible(log)
-    tracking = trackings(motion)
+    kinds = command_kinds(log, drives or {})
+    tracking = trackings(motion, [joint for joint, kind in kinds.items() if kind == "position"])
     found = [
-        *check_columns(log, joints),
+        *check_columns(log, joints, drives, controls),
         *check_clock(log),
         *check_values(log),
         *check_declared_units(log),
-        *check_scale(motion, tracking, ranges),
-        *check_motion(motion, tracking),
+        *check_scale(motion, tracking, ranges, kinds),
+        *check_motion(motion, tracking, kinds),
     ]
-    return _errors_first(found)
+    return worst_first(found)
 
 
 def validate_file(
@@ -61,6 +71,7 @@ def validate_file(
     *,
     joints: Sequence[str] | None = None,
     ranges: Mapping[str, tuple[float, float]] | None = None,
+    check: Callable[[Log], Sequence[Problem]] | None = None,
 ) -> tuple[Problem, ...]:
     """Problems of a log file: those of the file and, as far as it can be read, those of its content.
 
@@ -70,6 +81,8 @@ def validate_file(
         The file; one that is missing or unreadable is a problem too, never an exception.
     joints, ranges
         As for `validate_log`.
+    check : callable, optional
+        Finds the problems of its content in the place of `validate_log`, as one that knows the model does.
 
     Returns
     -------
@@ -78,9 +91,5 @@ def validate_file(
     """
     log, problems = load(Path(path))
     if log is not None:
-        problems += validate_log(log, joints=joints, ranges=ranges)
-    return _errors_first(problems)
-
-
-def _errors_first(problems: Sequence[Problem]) -> tuple[Problem, ...]:
-    return tuple(sorted(problems, key=lambda problem: problem.severity != "error"))
+        problems += tuple(check(log) if check else validate_log(log, joints=joints, ranges=ranges))
+    return worst_first(problems)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ import numpy as np
 from sysid_btr.errors import ModelError
 from sysid_btr.mujoco_conventions import SINGLE, slides
 from sysid_btr.terms.base import Scope, Term
+from sysid_btr.terms.drives import Drive, joint_drives
 from sysid_btr.units import CHANNEL_UNITS
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Robot:
 
         facts = {
             "joints": ", ".join(joint_names(self)),
-            "with a servo": ", ".join(servo_joints(self)),
+            "with a drive": ", ".join(driven_joints(self)),
             "bodies": ", ".join(body_names(self)),
             "mass": f"{float(self.model.body_mass.sum()):.4g} kg",
         }
@@ -71,7 +72,13 @@ class Robot:
 
     def names(self, scope: Scope) -> tuple[str, ...]:
         """Names that a term of this scope can have as its places, in model order."""
-        listing = {"body": body_names, "joint": joint_names, "servo": servo_joints}
+        listing: Mapping[Scope, Callable[[Robot], tuple[str, ...]]] = {
+            "body": body_names,
+            "joint": joint_names,
+            "drive": driven_joints,
+            "feedback": feedback_joints,
+            "servo": servo_joints,
+        }
         return listing[scope](self) if scope in listing else (scope,)
 
     @cached_property
@@ -159,23 +166,24 @@ def body_names(robot: Robot) -> tuple[str, ...]:
     return tuple(model.body(i).name for i in range(1, model.nbody) if model.body_mass[i] > 0)
 
 
+def driven_joints(robot: Robot) -> tuple[str, ...]:
+    """Joints with a drive of their own, in model order."""
+    return tuple(drive.joint for drive in joint_drives(robot.model))
+
+
+def feedback_joints(robot: Robot) -> tuple[str, ...]:
+    """Joints whose drive feeds back position or velocity, in model order."""
+    return tuple(drive.joint for drive in joint_drives(robot.model) if drive.kind != "torque")
+
+
 def servo_joints(robot: Robot) -> tuple[str, ...]:
     """Joints that a position servo drives, in model order."""
-    model = robot.model
-    return tuple(model.joint(int(model.actuator_trnid[a, 0])).name for a in servo_actuators(model))
+    return tuple(drive.joint for drive in servo_drives(robot.model))
 
 
-def servo_actuators(model: mujoco.MjModel) -> Sequence[int]:
-    """Actuators that act on a joint with a fixed gain and an affine bias."""
-    import mujoco
-
-    return [
-        a
-        for a in range(model.nu)
-        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
-        and model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
-    ]
+def servo_drives(model: mujoco.MjModel) -> tuple[Drive, ...]:
+    """Position servos, in model order."""
+    return tuple(drive for drive in joint_drives(model) if drive.kind == "position")
 
 
 def _digest(content: bytes) -> str:

@@ -332,6 +332,7 @@ def _begins(a: Replay, b: Replay) -> bool:
         and np.array_equal(a.log.time, b.log.time[:n])
         and all(np.array_equal(x, y) for x, y in zip(a.start, b.start, strict=True))
         and np.array_equal(a.grid.command, b.grid.command[: a.grid.steps])
+        and np.array_equal(a.grid.extra, b.grid.extra[: a.grid.steps])
     )
 
 

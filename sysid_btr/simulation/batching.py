@@ -77,9 +77,12 @@ def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ..
     steps = max(grid.steps for grid in grids)
     qpos, qvel = (np.repeat(np.stack([r.start[i] for r in replays]), m, axis=0) for i in (0, 1))
     last = np.minimum(np.arange(steps), np.array([[g.steps - 1] for g in grids]))
-    command = np.repeat(np.stack([g.command[k] for g, k in zip(grids, last, strict=True)]), m, axis=0)
+    command, extra = (
+        np.repeat(np.stack([rows[k] for rows, k in zip(of_logs, last, strict=True)]), m, axis=0)
+        for of_logs in ([g.command for g in grids], [g.extra for g in grids])
+    )
     own_logs = [(r.log, g) for r, g in zip(replays, grids, strict=True)]
-    setup = lead._prepare(batch, pairs, qpos, qvel, command, own_logs)
+    setup = lead._prepare(batch, pairs, qpos, qvel, command, own_logs, extra)
     # borders that any of the logs wants to see
     borders = np.unique(np.concatenate([grid.state for grid in grids]))
     states = lead.simulate(setup, borders)
@@ -104,6 +107,8 @@ def _joinable(a: Replay, b: Replay) -> bool:
         and a.threads == b.threads
         and a.log.meta.mount == b.log.meta.mount
         and _input_names(a) == _input_names(b)
+        and np.array_equal(a.index.scale, b.index.scale)
+        and a.grid.extra.shape[1] == b.grid.extra.shape[1]
     )
     return same and _different(a.model, b.model) is not None
 

@@ -12,6 +12,7 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import SINGLE
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import LINK_SUFFIX, JointAddresses, Term
+from sysid_btr.terms.drives import joint_drives, own_controls
 
 if TYPE_CHECKING:
     import mujoco
@@ -58,23 +59,23 @@ def compile_model(robot: Robot, log: Log, terms: Sequence[Term], numerics: Numer
 
 def make_index(model: mujoco.MjModel) -> JointAddresses:
     """Addresses of every hinge and slide joint of the model."""
-    import mujoco
-
     ids = {model.joint(i).name: i for i in range(model.njnt) if int(model.jnt_type[i]) in SINGLE}
     joints = tuple(name for name in ids if not name.endswith(LINK_SUFFIX))
-    actuator_of = {
-        int(model.actuator_trnid[a, 0]): a
-        for a in range(model.nu)
-        if model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
-    }
+    drives = {drive.joint: drive for drive in joint_drives(model)}
+    own_drives = [drives.get(joint) for joint in joints]
+    controls = own_controls(model)
     own = np.array([ids[j] for j in joints], dtype=np.int64)
     link = np.array([ids.get(j + LINK_SUFFIX, -1) for j in joints], dtype=np.int64)
     return JointAddresses(
         joints=joints,
         qpos=model.jnt_qposadr[own].astype(np.int64),
         dof=model.jnt_dofadr[own].astype(np.int64),
-        actuator=np.array([actuator_of.get(int(i), -1) for i in own], dtype=np.int64),
+        actuator=np.array([-1 if d is None else d.actuator for d in own_drives], dtype=np.int64),
         body=model.jnt_bodyid[own].astype(np.int64),
         link_qpos=np.where(link >= 0, model.jnt_qposadr[link], -1).astype(np.int64),
         link_dof=np.where(link >= 0, model.jnt_dofadr[link], -1).astype(np.int64),
+        drive=tuple(None if d is None else d.kind for d in own_drives),
+        scale=np.array([1.0 if d is None else d.scale for d in own_drives]),
+        controls=tuple(controls),
+        control=np.array(list(controls.values()), dtype=np.int64),
     )

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.interpolation import hermite
+from sysid_btr.models.commands import FED_FORWARD
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
@@ -24,7 +26,9 @@ class Grid:
     Attributes
     ----------
     timestep : s.
-    command : (steps, joints) mean of the held command over each step.
+    command : (steps, joints) mean of the held command over each step, in units of the joints.
+    extra : (steps, ...) what else is commanded: ctrl of actuators by their own name, then, where the log has any,
+        velocities and torques that are fed forward, each for all joints.
     sample_time : (n,) s since the first sample.
     state : (k,) indices of the step borders whose state is kept, increasing; 0 is the start.
     before, after : (n,) positions in `state` of the borders around each sample.
@@ -38,13 +42,20 @@ class Grid:
     before: IntArray
     after: IntArray
     fraction: FloatArray
+    extra: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def steps(self) -> int:
         return len(self.command)
 
 
-def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep: float) -> Grid:
+def make_grid(
+    log: Log,
+    joints: tuple[str, ...],
+    defaults: FloatArray,
+    timestep: float,
+    controls: Mapping[str, float] | None = None,
+) -> Grid:
     """Lay simulation steps over one episode of a log.
 
     Parameters
@@ -53,6 +64,7 @@ def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep:
     joints : (j,) joints in the order of the outputs.
     defaults : (j,) command of a joint that the log does not command.
     timestep : s.
+    controls : actuators commanded by their own name, and the ctrl of those that the log does not command.
     """
     time = log.time - log.time[0]
     exact = time / timestep
@@ -64,9 +76,14 @@ def make_grid(log: Log, joints: tuple[str, ...], defaults: FloatArray, timestep:
     state = np.unique(np.concatenate([low, high]))
     steps = max(int(state[-1]), 1)
     snapped = np.where(aligned, rounded * timestep, time)
+    still, own = np.zeros(len(joints)), dict(controls or {})
+    extra = [_mean_command(log, snapped, tuple(own), np.array(list(own.values())), timestep, steps)]
+    if any(log.joints(channel) for channel in FED_FORWARD):
+        extra += [_mean_command(log, snapped, joints, still, timestep, steps, channel) for channel in FED_FORWARD]
     return Grid(
         timestep=timestep,
         command=_mean_command(log, snapped, joints, defaults, timestep, steps),
+        extra=np.concatenate(extra, axis=1),
         sample_time=time,
         state=state,
         before=np.searchsorted(state, low),
@@ -89,7 +106,13 @@ def at_samples(grid: Grid, position: FloatArray, velocity: FloatArray) -> tuple[
 
 
 def _mean_command(
-    log: Log, time: FloatArray, joints: tuple[str, ...], defaults: FloatArray, timestep: float, steps: int
+    log: Log,
+    time: FloatArray,
+    joints: tuple[str, ...],
+    defaults: FloatArray,
+    timestep: float,
+    steps: int,
+    channel: str = "command",
 ) -> FloatArray:
     """Mean over each step of the command as the servo sees it; exact for a held command.
 
@@ -98,15 +121,15 @@ def _mean_command(
     from sysid_btr.io.resample import command_at
 
     result = np.tile(defaults, (steps, 1))
-    named = [j for j in joints if log.has("command", j)]
+    named = [j for j in joints if log.has(channel, j)]
     if not named:
         return result
     columns = [joints.index(j) for j in named]
     borders = np.arange(steps + 1) * timestep
     if log.meta.command_hold == "linear":
-        result[:, columns] = command_at(log, named, log.time[0] + (borders[:-1] + timestep / 2))
+        result[:, columns] = command_at(log, named, log.time[0] + (borders[:-1] + timestep / 2), channel)
         return result
-    held = command_at(log, named, log.time)
+    held = command_at(log, named, log.time, channel)
     result[:, columns] = mean_over_steps(time, held, timestep, steps)
     return result
 

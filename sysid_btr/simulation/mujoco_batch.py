@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import IntArray
 from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.simulator import States
 from sysid_btr.simulation.stepping import step_through
@@ -65,19 +65,19 @@ def _roll(batch: Batch, setup: Setup, borders: IntArray) -> States:
     """All steps in one call of the engine, or in a few: memory stays bounded whatever the length of the log."""
     import mujoco
 
-    index, nu, nv = setup.index, setup.model.nu, setup.model.nv
+    index, nv = setup.index, setup.model.nv
     states = States.empty(setup.size, len(borders), index)
     states.put(index, np.array([0]), batch.bind("qpos")[:, None], batch.bind("qvel")[:, None])
     spec = int(mujoco.mjtState.mjSTATE_CTRL.value)
     if setup.applied is not None:
         spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED.value)
-    driven = index.actuator >= 0
     for first in range(0, setup.steps, SEGMENT):
         last = min(first + SEGMENT, setup.steps)
-        control: FloatArray = np.zeros((setup.size, last - first, nu + (0 if setup.applied is None else nv)))
-        control[:, :, index.actuator[driven]] = setup.command[:, first:last, driven]
+        control = setup.ctrl(slice(first, last))
         if setup.applied is not None:
-            control[:, :, nu + index.dof] = setup.applied[:, first:last]
+            applied = np.zeros((*control.shape[:2], nv))
+            applied[:, :, index.dof] = setup.applied[:, first:last]
+            control = np.concatenate([control, applied], axis=2)
         records = batch.rollout(last - first, control, spec, record=("qpos", "qvel"))
         wanted = np.flatnonzero((borders > first) & (borders <= last))
         local = borders[wanted] - first - 1

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.models.commands import commanded
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.compiling import compile_model, made_elsewhere, make_index
 from sysid_btr.simulation.grid import Grid, at_samples, make_grid, step_inputs
@@ -89,8 +90,23 @@ class Replay:
         return initial_state(self.log, self.index.joints, self.model.qpos0[self.index.qpos])
 
     @cached_property
+    def idle(self) -> tuple[FloatArray, dict[str, float]]:
+        """Commands (j,) of joints and ctrl of actuators that the log does not command.
+
+        A position servo holds its joint where it starts; others do what the model's keyframe says, or nothing.
+        """
+        index, model = self.index, self.model
+        ctrl = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
+        driven = index.actuator >= 0
+        kept = np.zeros(len(index.joints))
+        kept[driven] = ctrl[index.actuator[driven]]
+        commands = np.where(index.driven_by("torque", "velocity"), kept / index.scale, self.start[0])
+        return commands, {name: float(ctrl[a]) for name, a in zip(index.controls, index.control, strict=True)}
+
+    @cached_property
     def grid(self) -> Grid:
-        return make_grid(self.log, self.index.joints, self.start[0], self.numerics.timestep)
+        commands, (defaults, controls) = commanded(self.log, self.model), self.idle
+        return make_grid(commands, self.index.joints, defaults, self.numerics.timestep, controls)
 
     def predict(self, candidates: FloatArray) -> Outputs:
         """All predicted sensors at once; for many candidates iterate over `chunks` instead."""
@@ -139,8 +155,8 @@ class Replay:
     def _run(self, candidates: FloatArray) -> Outputs:
         pairs, m, grid = self._values(candidates), len(candidates), self.grid
         qpos, qvel = (np.tile(start, (m, 1)) for start in self.start)
-        command: FloatArray = np.broadcast_to(grid.command, (m, *grid.command.shape))
-        setup = self._prepare(self.batch(pairs, m), pairs, qpos, qvel, command, ((self.log, grid),))
+        command, extra = (np.broadcast_to(x, (m, *x.shape)) for x in (grid.command, grid.extra))
+        setup = self._prepare(self.batch(pairs, m), pairs, qpos, qvel, command, ((self.log, grid),), extra)
         return self._go(setup, pairs, grid)
 
     def batch(self, pairs: Values, size: int) -> BatchModel:
@@ -155,6 +171,7 @@ class Replay:
         qvel: FloatArray,
         command: FloatArray,
         logs: Sequence[tuple[Log, Grid]],
+        extra: FloatArray | None = None,
     ) -> Setup:
         """A rollout of logs that each own an equal share of the candidates, see `prepare`."""
         return prepare(
@@ -166,6 +183,7 @@ class Replay:
             self.numerics,
             inputs=lambda: _inputs_of(logs, command.shape[1], batch.size),
             effort=self.effort,
+            extra=extra,
         )
 
     def simulate(self, setup: Setup, borders: IntArray) -> States:

@@ -283,6 +283,7 @@ class SegmentReplay(Replay):
             effort=self.effort,
             first=int(first[0]),
             lead=lead,
+            extra=self.grid.extra[rows],
         )
         place, motion = self._free_joint
         qpos, qvel = setup.state["qpos"], setup.state["qvel"]

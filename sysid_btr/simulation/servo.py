@@ -12,14 +12,17 @@ from sysid_btr.terms.base import BatchModel
 
 @dataclass(frozen=True, eq=False)
 class ServoLaw:
-    """Torque of the servos: gear (gain u + constant + stiffness q + damping dq), within limits.
+    """Torque of the drives: gear (gain u + constant + stiffness q + damping dq), within limits.
+
+    The command u is in units of the joint, and gain is that by which it acts.
 
     Computed here because MuJoCo's `actuator_force` lags the state by a substep.
 
     Attributes
     ----------
-    driven : (d,) positions among the joints of those that have a servo; the torque of the others is zero.
+    driven : (d,) positions among the joints of those that have a drive; the torque of the others is zero.
     gear, gain, constant, stiffness, damping : (m, d).
+    least, most : (m, d) commands beyond which the drive does not follow, infinite where there are none.
     low, high : (m, j) limits of the torque, infinite where there are none.
     """
 
@@ -29,6 +32,8 @@ class ServoLaw:
     constant: FloatArray
     stiffness: FloatArray
     damping: FloatArray
+    least: FloatArray
+    most: FloatArray
     low: FloatArray
     high: FloatArray
 
@@ -39,12 +44,17 @@ class ServoLaw:
         actuators = batch.index.actuator[driven]
         names = ("gear", "gainprm", "biasprm", "forcerange", "forcelimited")
         gear, gain, bias, forces, limited = (batch.read(f"actuator_{name}")[rows, actuators] for name in names)
-        gear = gear[..., 0]
+        scale = batch.index.scale[driven]
+        gear, gain, constant = gear[..., 0], gain[..., 0] * scale, bias[..., 0]
+        controlled = batch.model.actuator_ctrllimited[actuators].astype(bool)
+        reach = np.sort(batch.model.actuator_ctrlrange[actuators] / scale[:, None], axis=-1)
+        least, most = np.where(controlled, reach[:, 0], -np.inf), np.where(controlled, reach[:, 1], np.inf)
         low, high = (np.full((len(gear), len(batch.index.joints)), infinite) for infinite in (-np.inf, np.inf))
         limits = np.sort(gear[..., None] * forces, axis=-1)
         low[:, driven] = np.where(limited, limits[..., 0], -np.inf)
         high[:, driven] = np.where(limited, limits[..., 1], np.inf)
-        return cls(driven, gear, gain[..., 0], bias[..., 0], bias[..., 1] * gear, bias[..., 2] * gear, low, high)
+        stiffness, damping = bias[..., 1] * gear, bias[..., 2] * gear
+        return cls(driven, gear, gain, constant, stiffness, damping, least, most, low, high)
 
     def unlimited(self, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
         """Torque that the servos would like to give; all are (m, j), or (m, samples, j)."""
@@ -52,7 +62,7 @@ class ServoLaw:
         u, q, v = (x if every else x[..., self.driven] for x in (command, qpos, qvel))
         numbers = (self.gear, self.gain, self.constant, self.stiffness, self.damping)
         gear, gain, constant, stiffness, damping = numbers if u.ndim == 2 else (x[:, None] for x in numbers)
-        own: FloatArray = gain * u
+        own: FloatArray = gain * (np.clip(u, self.least, self.most) if np.isfinite(self.most).any() else u)
         own += constant
         own += stiffness * q
         own += damping * v

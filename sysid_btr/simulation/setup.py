@@ -36,7 +36,8 @@ class Setup:
     batch : compiled model, addresses of the joints, step, and the fields in which the candidates differ.
     state : MjData field -> (m, ...) at the start; what is not named is as `mj_resetData` leaves it, and only the
         state moves: forces in it (`xfrc_applied`) act all the time.
-    command : (m, steps, j) as they reach the servos, held over each step.
+    command : (m, steps, j) as they reach the drives, in units of the joints, held over each step; see `ctrl`.
+    control : (m, steps, nc) of actuators that are commanded by their own name, in ctrl, or None.
     applied : (m, steps, j) torques at the joints known in advance, Nm or N.
     laws : terms that act at every step, in the order in which they do.
     inputs : measured inputs of the drives, (steps, m) each, for laws.
@@ -52,6 +53,7 @@ class Setup:
     inputs: dict[str, FloatArray] = field(default_factory=dict)
     held_steps: int = 0
     effort: bool = False
+    control: FloatArray | None = None
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -69,6 +71,22 @@ class Setup:
     @property
     def steps(self) -> int:
         return int(self.command.shape[1])
+
+    def ctrl(self, steps: slice) -> FloatArray:
+        """(m, k, nu) MuJoCo's ctrl in some of the steps."""
+        index, command = self.index, self.command[:, steps]
+        found = np.zeros((*command.shape[:2], self.model.nu))
+        driven = np.flatnonzero(index.actuator >= 0)
+        found[:, :, index.actuator[driven]] = as_ctrl(index, driven, command[:, :, driven])
+        if self.control is not None:
+            found[:, :, index.control] = self.control[:, steps]
+        return found
+
+
+def as_ctrl(index: JointAddresses, joints: IntArray, command: FloatArray) -> FloatArray:
+    """MuJoCo's ctrl for commands (..., k) of some joints, by their positions (k,) among all."""
+    scale = index.scale[joints]
+    return command if np.all(scale == 1) else command * scale
 
 
 def write_terms(batch: BatchModel, pairs: Values) -> BatchModel:
@@ -90,6 +108,7 @@ def prepare(
     effort: bool = False,
     first: int = 0,
     lead: int = 0,
+    extra: FloatArray | None = None,
 ) -> Setup:
     """What terms make of initial states, commands and torques, once their fields are written.
 
@@ -103,7 +122,11 @@ def prepare(
     effort : whether the torques of the servos are asked for.
     first : steps on the clock of the log before the first one, for torques known in advance.
     lead : commands from before the first step, that reach into it when they are delayed.
+    extra : (m, lead + steps, ...) what else was commanded, as `Grid.extra` has it.
     """
+    controls = len(batch.index.controls)
+    if extra is not None and extra.shape[-1] > controls:
+        command = command + fed_forward(batch, *np.split(extra[..., controls:], 2, axis=-1))
     applied: FloatArray | None = None
     border_time = batch.timestep * (first + np.arange(command.shape[1] - lead + 1, dtype=np.float64))
     for term, values in pairs:
@@ -125,6 +148,7 @@ def prepare(
         inputs() if laws else {},
         numerics.held_steps,
         effort,
+        extra[:, lead:, :controls] if extra is not None and controls else None,
     )
 
 
@@ -133,6 +157,24 @@ def laws_of(index: JointAddresses, pairs: Values) -> tuple[Law, ...]:
     laws = [Law(term, values, _places(index, term)) for term, values in pairs if type(term).overrides("law")]
     # what a servo does comes before what depends on it
     return tuple(sorted(laws, key=lambda law: law.term.law_acts == ("friction",)))
+
+
+def fed_forward(batch: BatchModel, velocity: FloatArray, torque: FloatArray) -> FloatArray:
+    """Change of the commands that acts as wanted velocities and torques beside them do, all (m, steps, j).
+
+    A drive with torque = kp (q* - q) + kd (v* - v) + tau* obeys q* + (kd v* + tau*) / kp.
+    """
+    index, driven = batch.index, np.flatnonzero(batch.index.actuator >= 0)
+    actuators = index.actuator[driven]
+    names = ("gear", "gainprm", "biasprm")
+    gear, gain, bias = (batch.read(f"actuator_{name}")[:, None, actuators] for name in names)
+    servo = index.driven_by("position")[driven]
+    force = torque[..., driven] / gear[..., 0]
+    force -= np.where(servo, bias[..., 2] * gear[..., 0] * velocity[..., driven], 0.0)
+    slope = gain[..., 0] * index.scale[driven]
+    change = np.zeros(torque.shape)
+    change[..., driven] = np.divide(force, slope, out=np.zeros_like(force), where=slope != 0)
+    return change
 
 
 def _places(index: JointAddresses, term: Term) -> IntArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.simulation.servo import ServoLaw
-from sysid_btr.simulation.setup import Setup
+from sysid_btr.simulation.setup import Setup, as_ctrl
 from sysid_btr.simulation.simulator import States
 from sysid_btr.terms.base import Step
 
@@ -95,7 +95,12 @@ class _Drive:
             joint_torque = step.joint_torque if joint_torque is None else step.joint_torque + joint_torque
         if ticks:
             self.held = self.torque()[:, self.driven] / self.law.gear
-        self.ctrl[:, self.actuators] = command[:, self.driven] if self.held is None else self.held
+        if self.held is None:
+            self.ctrl[:, self.actuators] = as_ctrl(setup.index, self.driven, command[:, self.driven])
+        else:
+            self.ctrl[:, self.actuators] = self.held
+        if setup.control is not None:
+            self.ctrl[:, setup.index.control] = setup.control[:, k]
         if joint_torque is not None:
             self.qfrc[:, self.dof] = joint_torque
 

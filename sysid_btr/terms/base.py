@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.terms.drives import DriveKind
 from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, largest_scale
 
 if TYPE_CHECKING:
@@ -69,7 +70,10 @@ class JointAddresses:
     Attributes
     ----------
     joints : joint names in the order of the outputs, (nj,).
-    qpos, dof, actuator, body : their addresses, (nj,); actuator is -1 for a joint without a servo.
+    qpos, dof, actuator, body : their addresses, (nj,); actuator is -1 for a joint without a drive.
+    drive : (nj,) kind of drive, so of command; None for a joint without one.
+    scale : (nj,) ctrl per command in units of the joint.
+    controls : actuators that are commanded by their own name, in ctrl, and their numbers, (nc,).
     link_qpos, link_dof : addresses of a second, play or compliance joint on the link side, -1 where none.
     base : addresses in qpos and qvel of a free base that is to be recorded, None where it is not.
     """
@@ -81,12 +85,20 @@ class JointAddresses:
     body: IntArray
     link_qpos: IntArray
     link_dof: IntArray
+    drive: tuple[DriveKind | None, ...]
+    scale: FloatArray
+    controls: tuple[str, ...]
+    control: IntArray
     base: tuple[int, int] | None = None
 
     def of(self, names: Sequence[str]) -> IntArray:
         """Positions of joint names in the outputs."""
         lookup = {name: i for i, name in enumerate(self.joints)}
         return np.array([lookup[name] for name in names], dtype=np.int64)
+
+    def driven_by(self, *kinds: DriveKind) -> BoolArray:
+        """(nj,) whether the drive of a joint is of one of these kinds."""
+        return np.array([kind in kinds for kind in self.drive], dtype=bool)
 
 
 Fields = dict[str, FloatArray]
@@ -198,7 +210,8 @@ class Outputs:
     base: FloatArray | None = None
 
 
-Scope = Literal["body", "joint", "servo", "robot"]
+Scope = Literal["body", "joint", "drive", "feedback", "servo", "robot"]
+"""Bodies with mass; joints: all, with a drive, with one that feeds position or velocity back, position; the whole."""
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ class DriveDisturbanceTrain(ExternalDisturbanceTrain):
     def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         actuator = batch.index.actuator[batch.index.of(self.places)]
         gains, gears = batch.read("actuator_gainprm"), batch.read("actuator_gear")
-        stiffness = gains[:, actuator, 0] * gears[:, actuator, 0]
+        stiffness = gains[:, actuator, 0] * gears[:, actuator, 0] * batch.index.scale[batch.index.of(self.places)]
         time = batch.timestep * np.arange(command.shape[1] + 1, dtype=np.float64)
         shaped = np.array(command)
         for place, column in enumerate(batch.index.of(self.places)):

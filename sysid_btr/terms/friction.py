@@ -183,7 +183,7 @@ class LoadFriction(Effect):
 
     name: ClassVar[str] = "load_friction"
     title: ClassVar[str] = "friction per unit of load"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("friction",)
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("ratio", "1", 0.0, 0.0, 0.9, 0.08),)
     steps: ClassVar[tuple[float, ...]] = (1.0, 4.0)

@@ -132,8 +132,19 @@ def check_expression(name: str, robot: Robot) -> None:
         _parse_one(f"{label}:{places}", robot, None, table)
 
 
+SCOPES: Mapping[Scope, str] = {
+    "body": "body with mass",
+    "joint": "joint",
+    "drive": "joint with a drive",
+    "feedback": "joint with a servo of position or velocity",
+    "servo": "joint with a servo of position",
+    "robot": "robot",
+}
+"""What names of a scope are."""
+
+
 def _scope_noun(scope: Scope) -> str:
-    return {"body": "body with mass", "servo": "joint with a servo"}.get(scope, scope)
+    return SCOPES[scope]
 
 
 def _motors(scope: Scope, names: list[str], robot: Robot) -> list[tuple[str, ...]]:
@@ -143,7 +154,9 @@ def _motors(scope: Scope, names: list[str], robot: Robot) -> list[tuple[str, ...
     for name in names:
         if name in seen:
             continue
-        tied = next((t for t in robot.tied if name in t), (name,)) if scope == "servo" else (name,)
+        tied = (
+            next((t for t in robot.tied if name in t), (name,)) if scope in ("drive", "feedback", "servo") else (name,)
+        )
         groups.append(tuple(t for t in tied if t in names))
         seen.update(groups[-1])
     return groups

@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import BatchModel, Fields, Kind, Step
+from sysid_btr.terms.drives import joint_drives
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -27,7 +28,7 @@ class TorqueLimit(Effect):
     name: ClassVar[str] = "torque_limit"
     field: ClassVar[str] = "force_limit"
     title: ClassVar[str] = "limit of the torque"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("limit", "Nm", 100.0, 0.01, 100.0, 0.1),)
     held: ClassVar[tuple[str, ...]] = ("limit",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
@@ -46,10 +47,9 @@ class TorqueLimit(Effect):
 
     @classmethod
     def own_value(cls, model: mujoco.MjModel, place: str) -> float:
-        joint = model.joint(place).id
-        for a in range(model.nu):
-            if model.actuator_trnid[a, 0] == joint and model.actuator_forcelimited[a]:
-                return float(model.actuator_forcerange[a, 1] * abs(model.actuator_gear[a, 0]))
+        for drive in joint_drives(model):
+            if drive.joint == place and model.actuator_forcelimited[drive.actuator]:
+                return float(model.actuator_forcerange[drive.actuator, 1] * abs(model.actuator_gear[drive.actuator, 0]))
         return float("inf")
 
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
@@ -75,7 +75,7 @@ class SpeedTorqueLimit(Effect):
 
     name: ClassVar[str] = "speed_torque_limit"
     title: ClassVar[str] = "torque limit that falls with speed"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("limit",)
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("stall", "Nm", 100.0, 0.01, 100.0, 0.1),

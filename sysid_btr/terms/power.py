@@ -72,7 +72,7 @@ class ThermalDerating(Effect):
 
     name: ClassVar[str] = "thermal_derating"
     title: ClassVar[str] = "loss of torque with heat"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("alpha", "1/Nm2", 0.0, 0.0, 10.0, 0.1),

@@ -51,8 +51,10 @@ class EncoderOffsetInLoop(EncoderOffset):
     variant: ClassVar[str] = "loop"
 
     def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
-        shaped = command.copy()
-        shaped[:, :, batch.index.of(self.places)] -= values[:, None, :, 0]
+        shaped, columns = command.copy(), batch.index.of(self.places)
+        # nothing but a command of position is compared with what the encoder shows
+        fed = batch.index.driven_by("position")[columns]
+        shaped[:, :, columns[fed]] -= values[:, None, fed, 0]
         return shaped
 
     def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:

@@ -14,7 +14,7 @@ from sysid_btr.terms.scales import JointScale
 
 
 def servos(batch: BatchModel, places: tuple[str, ...]) -> IntArray:
-    """Actuators of some joints."""
+    """Actuators of some joints with a drive."""
     result: IntArray = batch.index.actuator[batch.index.of(places)]
     return result
 
@@ -47,9 +47,9 @@ class Kp(Effect):
 
 @dataclass(frozen=True)
 class Kv(Effect):
-    """Derivative gain of a position servo, as a factor.
+    """Derivative gain of a position servo, or the gain of a velocity servo, as a factor.
 
-    Native: the third of `actuator_biasprm`.
+    Native: the third of `actuator_biasprm`; of a velocity servo also the first of `actuator_gainprm`.
     """
 
     name: ClassVar[str] = "kv"
@@ -59,13 +59,18 @@ class Kv(Effect):
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("viscous_damping", "a logged effort or current; the two are confounded in positions alone"),
     )
-    scope: ClassVar[Scope] = "servo"
+    scope: ClassVar[Scope] = "feedback"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.0, 5.0, 0.1),)
 
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        bias = batch.read("actuator_biasprm")
-        bias[:, servos(batch, self.places), 2] *= values[:, :, 0]
-        return {"actuator_biasprm": bias}
+        ids = servos(batch, self.places)
+        gain, bias = batch.read("actuator_gainprm"), batch.read("actuator_biasprm")
+        bias[:, ids, 2] *= values[:, :, 0]
+        velocity = batch.index.driven_by("velocity")[batch.index.of(self.places)]
+        if not velocity.any():
+            return {"actuator_biasprm": bias}
+        gain[:, ids[velocity], 0] *= values[:, velocity, 0]
+        return {"actuator_gainprm": gain, "actuator_biasprm": bias}
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,7 @@ class TorqueConstant(Effect):
         ("kp", "motion in which the drive saturates"),
         ("mass", "motion of several loads"),
     )
-    scope: ClassVar[Scope] = "servo"
+    scope: ClassVar[Scope] = "drive"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.2, 3.0, 0.05),)
 
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
@@ -138,7 +143,7 @@ class BackEmf(Effect):
 
     name: ClassVar[str] = "back_emf"
     title: ClassVar[str] = "damping by back-EMF"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "limit")
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("b", "Nm s/rad", 0.0, 0.0, 10.0, 0.05),)
     needs: ClassVar[str] = "enabled"
@@ -171,7 +176,7 @@ class CommandDelay(Effect):
     name: ClassVar[str] = "command_delay"
     also: ClassVar[tuple[str, ...]] = ("delay",)
     title: ClassVar[str] = "delay of the command"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.15, 0.004),)
     everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (

@@ -42,7 +42,7 @@ class Backlash(Effect):
     name: ClassVar[str] = "backlash"
     title: ClassVar[str] = "play in the gear"
     variant: ClassVar[str] = "link"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     structural: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("play", "rad", 0.0, 0.0, 0.2, 0.004),
@@ -138,7 +138,7 @@ class JointCompliance(Effect):
     name: ClassVar[str] = "joint_compliance"
     title: ClassVar[str] = "softness of the gear"
     variant: ClassVar[str] = "link"
-    scope: ClassVar = "servo"
+    scope: ClassVar = "drive"
     structural: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("softness", "rad/Nm", 0.0, 0.0, 0.2, 0.005),)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (

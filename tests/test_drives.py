@@ -1,0 +1,292 @@
+"""What a command means follows the actuator: replays against plain MuJoCo, told in its own ctrl."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from toys import make_log, robot_from_xml
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.errors import ModelError
+from sysid_btr.identify.replay import replay_log
+from sysid_btr.identify.study import make_study
+from sysid_btr.io.log import Log
+from sysid_btr.io.problem import Problem
+from sysid_btr.io.validation import validate_log
+from sysid_btr.models.log_checks import check_log
+from sysid_btr.models.robot import Robot
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
+from sysid_btr.terms.base import Outputs, Term
+from sysid_btr.terms.friction import StribeckFriction
+from sysid_btr.terms.grammar import parse_parameters
+
+STEP = 0.002
+NUMERICS = Numerics("implicitfast", STEP)
+TIME = np.arange(401) * 0.004
+"""Two steps a sample."""
+WAVE = 0.4 * np.sin(7 * TIME) * (1 - np.exp(-((TIME / 0.1) ** 2)))
+
+ARM = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.02"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.6"/>
+      <body name="lower" pos="0 0 -0.2">
+        <joint name="elbow" axis="0 1 0" damping="0.1" armature="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.4"/>
+      </body>
+    </body>
+  </worldbody>
+  {more}
+</mujoco>
+"""
+ACTUATORS = {
+    "torque": '<motor name="{j}" joint="{j}"/>',
+    "geared torque": '<motor name="{j}" joint="{j}" gear="-30"/>',
+    "scaled torque": '<general name="{j}" joint="{j}" gainprm="2.5" gear="3"/>',
+    "position": '<position name="{j}" joint="{j}" kp="30" kv="1"/>',
+    "geared position": '<position name="{j}" joint="{j}" kp="0.02" kv="0.001" gear="50"/>',
+    "scaled position": '<general name="{j}" joint="{j}" gainprm="0.2" biastype="affine" biasprm="0 -30 -1"/>',
+    "velocity": '<velocity name="{j}" joint="{j}" kv="2"/>',
+    "geared velocity": '<velocity name="{j}" joint="{j}" kv="0.02" gear="-10"/>',
+}
+CTRL = {
+    "torque": lambda c: c,
+    "geared torque": lambda c: -c / 30,
+    "scaled torque": lambda c: c / 7.5,
+    "position": lambda c: c,
+    "geared position": lambda c: 50 * c,
+    "scaled position": lambda c: 30 * c / 0.2,
+    "velocity": lambda c: c,
+    "geared velocity": lambda c: -10 * c,
+}
+"""Of a command of the joint, by hand."""
+
+
+def arm(actuator: str, more: str = "") -> Robot:
+    """Two joints under gravity with the same kind of actuator."""
+    both = "".join(actuator.format(j=j) for j in ("shoulder", "elbow"))
+    return robot_from_xml(ARM.format(more=f"<actuator>{both}{more}</actuator>"))
+
+
+def commands(**channels: FloatArray) -> Log:
+    """Commands and a start at rest at zero."""
+    return make_log(TIME, {name.replace("__", "."): values for name, values in channels.items()}, sample_period=0.004)
+
+
+def replayed(robot: Robot, log: Log, terms: tuple[Term, ...] = (), values: Any = (), **options: Any) -> Outputs:
+    return Replay(robot, log, terms, NUMERICS, **options).predict(np.atleast_2d(np.asarray(values, dtype=np.float64)))
+
+
+def stepped(robot: Robot, ctrl: FloatArray, watched: tuple[str, ...] = ("shoulder", "elbow")) -> FloatArray:
+    """(n, joints) of plain MuJoCo, with friction as stiff as a replay has it; ctrl (n, nu) held between samples."""
+    model = Replay(robot, commands(), (), NUMERICS).model
+    data = mujoco.MjData(model)
+    adr = [model.joint(j).qposadr[0] for j in watched]
+    found = [data.qpos[adr].copy()]
+    for row in ctrl[:-1]:
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, 2)
+        found.append(data.qpos[adr].copy())
+    return np.array(found)
+
+
+def only(log: Log, robot: Robot, joints: tuple[str, ...] = ("shoulder", "elbow")) -> FloatArray:
+    replay = Replay(robot, log, (), NUMERICS)
+    return replay.predict(np.zeros((1, 0))).position[0][:, replay.index.of(joints)]
+
+
+@pytest.mark.parametrize("drive", ACTUATORS)
+def test_a_command_is_in_units_of_the_joint_whatever_the_actuator(drive: str) -> None:
+    robot = arm(ACTUATORS[drive])
+    log = commands(command__shoulder=WAVE, command__elbow=-2 * WAVE)
+    ctrl = np.column_stack([CTRL[drive](WAVE), CTRL[drive](-2 * WAVE)])
+    np.testing.assert_allclose(only(log, robot), stepped(robot, ctrl), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("drive", ACTUATORS)
+def test_what_steps_in_python_and_what_predicts_the_torque_know_the_same_drive(drive: str) -> None:
+    robot = arm(ACTUATORS[drive])
+    log = commands(command__shoulder=WAVE, command__elbow=-2 * WAVE)
+    whole = replayed(robot, log, effort=True)
+    law = StribeckFriction(("elbow",))
+    neutral = replayed(robot, log, (law,), law.neutral, effort=True)
+    np.testing.assert_allclose(neutral.position, whole.position, rtol=0, atol=1e-10)
+    assert whole.effort is not None
+    if "torque" in drive:
+        np.testing.assert_allclose(whole.effort[0, :-1, 0], WAVE[:-1], rtol=0, atol=1e-12)
+
+
+def test_a_command_can_be_ctrl_by_the_actuators_name_or_by_what_the_log_says_of_itself() -> None:
+    robot = arm('<position name="{j}_servo" joint="{j}" kp="0.02" kv="0.001" gear="50"/>')
+    told = only(commands(command__shoulder=WAVE, command__elbow=-2 * WAVE), robot)
+    by_name = commands(command__shoulder_servo=50 * WAVE, command__elbow_servo=-100 * WAVE)
+    np.testing.assert_allclose(only(by_name, robot), told, rtol=0, atol=1e-12)
+    by_space = commands(command__shoulder=50 * WAVE, command__elbow=-100 * WAVE)
+    log = make_log(TIME, dict(by_space.channels), command_space="ctrl")
+    np.testing.assert_allclose(only(log, robot), told, rtol=0, atol=1e-12)
+
+
+def test_a_limit_of_the_ctrl_is_one_of_the_torque_too() -> None:
+    robot = arm('<motor name="{j}" joint="{j}" gear="2" ctrlrange="-0.1 0.1"/>')
+    found = replayed(robot, commands(command__shoulder=WAVE, command__elbow=0 * WAVE), effort=True)
+    assert found.effort is not None
+    np.testing.assert_allclose(found.effort[0, :-1, 0], np.clip(WAVE, -0.2, 0.2)[:-1], rtol=0, atol=1e-12)
+
+
+GRIPPER = """
+<tendon><fixed name="both"><joint joint="shoulder" coef="0.5"/><joint joint="elbow" coef="0.5"/></fixed></tendon>
+<actuator>
+  <general name="grip" tendon="both" gainprm="0.2" biastype="affine" biasprm="0 -20 -1" ctrlrange="0 255"/>
+</actuator>
+"""
+
+
+@pytest.mark.parametrize("law", [False, True])
+def test_an_actuator_of_a_tendon_is_commanded_by_its_name(law: bool) -> None:
+    robot = robot_from_xml(ARM.format(more=GRIPPER))
+    ctrl = 100 + 100 * WAVE
+    terms = (StribeckFriction(("elbow",)),) if law else ()
+    values = terms[0].neutral if terms else ()
+    found = replayed(robot, commands(command__grip=ctrl), terms, values).position[0]
+    np.testing.assert_allclose(found, stepped(robot, ctrl[:, None]), rtol=0, atol=1e-10)
+    assert np.abs(found).max() > 0.1
+
+
+def test_an_actuator_that_is_not_commanded_keeps_what_the_keyframe_says() -> None:
+    key = '<keyframe><key ctrl="120" qpos="0 0"/></keyframe>'
+    robot = robot_from_xml(ARM.format(more=GRIPPER + key))
+    np.testing.assert_allclose(only(commands(), robot), stepped(robot, np.full((401, 1), 120.0)), rtol=0, atol=1e-10)
+
+
+def test_a_position_is_commanded_with_velocity_and_torque_fed_forward() -> None:
+    """torque = kp (q* - q) + kd (v* - v) + tau*, with kp and kd as a candidate has them."""
+    robot = arm('<position name="{j}" joint="{j}" kp="0.3" kv="0.02" gear="10"/>')
+    speed, push = 2 * WAVE, 0.3 * np.cos(5 * TIME)
+    log = commands(command__shoulder=WAVE, command_velocity__shoulder=speed, command_effort__shoulder=push)
+    terms = parse_parameters(["kp:shoulder", "kv:shoulder"], robot)
+    found = replayed(robot, log, terms, [1.2, 0.7], effort=True)
+    kp, kd = 1.2 * 0.3, 0.7 * 0.02
+    other = robot_from_xml(
+        ARM.format(
+            more=f"""<actuator>
+            <position name="shoulder" joint="shoulder" kp="{kp}" kv="{kd}" gear="10"/>
+            <position name="elbow" joint="elbow" kp="0.3" kv="0.02" gear="10"/>
+            </actuator>"""
+        )
+    )
+    # in ctrl: forces before the gear
+    ctrl = 10 * WAVE + (kd * 10 * speed + push / 10) / kp
+    np.testing.assert_allclose(found.position[0], stepped(other, np.column_stack([ctrl, 0 * ctrl])), rtol=0, atol=1e-10)
+    assert found.effort is not None
+    q, v = found.position[0, :-1, 0], found.velocity[0, :-1, 0]
+    law = 100 * kp * (WAVE[:-1] - q) + 100 * kd * (speed[:-1] - v) + push[:-1]
+    np.testing.assert_allclose(found.effort[0, :-1, 0], law, rtol=0, atol=1e-9)
+
+
+def test_the_gain_of_a_velocity_servo_is_one_number() -> None:
+    robot, log = arm(ACTUATORS["velocity"]), commands(command__shoulder=WAVE, command__elbow=WAVE)
+    terms = parse_parameters(["kv:shoulder,elbow=shared"], robot)
+    ctrl = np.column_stack([WAVE, WAVE])
+    expected = stepped(arm(ACTUATORS["velocity"].replace('"2"', '"3"')), ctrl)
+    np.testing.assert_allclose(replayed(robot, log, terms, [1.5]).position[0], expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("drive", ["torque", "geared torque"])
+def test_without_a_command_the_measured_torque_drives_a_motor(drive: str) -> None:
+    robot = arm(ACTUATORS[drive])
+    log = commands(effort__shoulder=WAVE, effort__elbow=-2 * WAVE)
+    ctrl = np.column_stack([CTRL[drive](WAVE), CTRL[drive](-2 * WAVE)])
+    np.testing.assert_allclose(only(log, robot), stepped(robot, ctrl), rtol=0, atol=1e-10)
+
+
+# --- never in silence -------------------------------------------------------------------------------------
+
+
+def found(robot: Robot, log: Log, severity: str = "error") -> dict[str, Problem]:
+    """Problems of the commands by code; a fit and a replay refuse what is an error."""
+    problems = [p for p in check_log(robot, log) if p.code.startswith(("command.", "actuator."))]
+    told = {p.code: p for p in problems if p.severity == severity}
+    for attempt in (replay_log, lambda r, one: make_study(r, [one])):
+        if severity == "error" and told:
+            with pytest.raises(ModelError) as caught:
+                attempt(robot, log)
+            assert all(code in str(caught.value) for code in told)
+    return told
+
+
+def moving(log: Log, **columns: FloatArray) -> Log:
+    """A log in which both joints move and are measured."""
+    sensed = {f"position.{j}": 0.2 * np.sin(3 * TIME + i) for i, j in enumerate(("shoulder", "elbow"))}
+    return replace(log, channels={**log.channels, **sensed, **columns})
+
+
+def test_a_command_of_a_joint_without_an_actuator_is_an_error() -> None:
+    robot = robot_from_xml(ARM.format(more='<actuator><motor name="m" joint="elbow"/></actuator>'))
+    problem = found(robot, moving(commands(command__shoulder=WAVE, command__elbow=WAVE)))["command.undriven"]
+    assert problem.where == "command.shoulder"
+    assert "--servo" in problem.remedy
+
+
+def test_a_command_that_nothing_in_the_model_is_called_after_is_an_error() -> None:
+    robot = arm(ACTUATORS["position"])
+    assert "command.undriven" in found(robot, moving(commands(command__wrist=WAVE)))
+
+
+def test_two_actuators_of_a_joint_have_each_a_command_and_the_joint_none() -> None:
+    both = '<position name="p" joint="shoulder" kp="20"/><velocity name="v" joint="shoulder" kv="1"/>'
+    robot = robot_from_xml(ARM.format(more=f"<actuator>{both}</actuator>"))
+    problem = found(robot, moving(commands(command__shoulder=WAVE)))["command.crowded"]
+    assert "command.p, command.v" in problem.remedy
+    each = commands(command__p=WAVE, command__v=2 * WAVE)
+    assert found(robot, moving(each)) == {}
+    np.testing.assert_allclose(only(each, robot), stepped(robot, np.column_stack([WAVE, 2 * WAVE])), rtol=0, atol=1e-10)
+
+
+def test_an_actuator_without_a_unit_of_its_joint_is_commanded_in_ctrl_alone() -> None:
+    robot = robot_from_xml(
+        ARM.format(more='<actuator><intvelocity name="i" joint="shoulder" kp="20" actrange="-3 3"/></actuator>')
+    )
+    assert "command.no_meaning" in found(robot, moving(commands(command__shoulder=WAVE)))
+    own = commands(command__i=WAVE)
+    np.testing.assert_allclose(only(own, robot), stepped(robot, WAVE[:, None]), rtol=0, atol=1e-10)
+
+
+def test_one_actuator_has_one_command() -> None:
+    robot = arm('<position name="{j}_servo" joint="{j}" kp="20"/>')
+    log = moving(commands(command__shoulder=WAVE, command__shoulder_servo=WAVE))
+    assert "command.twice" in found(robot, log)
+
+
+def test_what_the_log_says_its_commands_are_must_be_what_the_actuators_take() -> None:
+    log = moving(commands(command__shoulder=WAVE, command__elbow=WAVE))
+    positions = replace(log, meta=replace(log.meta, drive="position"))
+    assert "command.kind" in found(arm(ACTUATORS["torque"]), positions)
+    assert found(arm(ACTUATORS["geared position"]), positions) == {}
+
+
+def test_positions_are_not_taken_for_torques_in_silence() -> None:
+    log = moving(commands())
+    late = {f"command.{j}": np.roll(log.channels[f"position.{j}"], -5) for j in ("shoulder", "elbow")}
+    assert "command.kind" in found(arm(ACTUATORS["torque"]), replace(log, channels={**log.channels, **late}))
+
+
+def test_what_nothing_commands_is_listed() -> None:
+    robot = robot_from_xml(ARM.format(more=GRIPPER))
+    log = moving(commands(effort__shoulder=WAVE))
+    assert found(robot, log, "note")["actuator.idle"].where == "grip"
+
+
+def test_torques_are_neither_degrees_nor_late_nor_dead() -> None:
+    """15 Nm at a joint of 3 rad, 0 Nm at the other, which swings."""
+    log = moving(commands(command__shoulder=15 * np.sin(9 * TIME), command__elbow=0 * TIME))
+    assert [p for p in check_log(arm(ACTUATORS["torque"]), log) if p.severity != "note"] == []
+    alone = replace(log, meta=replace(log.meta, drive="torque"))
+    assert [p for p in validate_log(alone) if p.severity != "note"] == []
