@@ -91,6 +91,8 @@ def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[
     for effect in effects:
         if effect.needs == GROUND and not floating:
             continue
+        if effect.needs == "effort" and not any(episode.logged(("effort",)) for episode in study.train):
+            continue
         if effect.needs == "enabled" and not any(_switched(episode.log) for episode in study.train):
             continue
         result.append(effect)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 JOINT = 1
 """Kind of a tendon's part (mjtWrap)."""
-NOT_RIGID = ("dof_frictionloss", "tendon_frictionloss", "actuator_")
+NOT_RIGID = ("dof_frictionloss", "dof_armature", "dof_damping", "tendon_frictionloss", "actuator_")
 """Beginnings of fields that the torque of the rigid bodies does not depend on."""
 ROUNDS = 8
 """In which friction that follows the servo's torque is found: a ratio of 0.5 is within 0.4 % then."""
@@ -65,7 +65,7 @@ class InverseReplay(Replay):
                 step = self._under_laws(laws, i, effort[i], load[i])
                 own = np.maximum(friction[i] + step.friction, 0.0)
                 effort[i] = rigid[i] + own * motion.direction - step.joint_torque
-        effort = np.stack([motion.low_passed(one) for one in effort - applied])
+        effort = motion.low_passed(effort - applied)
         shape = (m, n, joints)
         outputs = Outputs(
             motion.time,
@@ -86,13 +86,17 @@ class InverseReplay(Replay):
         shape = (batch.size, *motion.position.shape)
         total, load = np.empty(shape), np.empty(shape)
         found: dict[bytes, int] = {}
+        # inertia of rotors and damping at the joints, which many candidates differ in, are added apart
+        armature, damping = batch.read("dof_armature")[:, dof], batch.read("dof_damping")[:, dof]
         for i in range(batch.size):
             fields = {n: v[i] for n, v in batch.fields.items() if not n.startswith(NOT_RIGID)}
             first = found.setdefault(b"".join(v.tobytes() for v in fields.values()), i)
             if first < i:
                 total[i], load[i] = total[first], load[first]
                 continue
-            own = BatchModel(batch.candidate(i), batch.index, batch.timestep, len(motion.time))
+            alone = batch.candidate(i)
+            alone.dof_armature[:], alone.dof_damping[:] = 0.0, 0.0
+            own = BatchModel(alone, batch.index, batch.timestep, len(motion.time))
             qpos = np.tile(own.model.qpos0, (own.size, 1))
             qvel, acceleration = np.zeros((own.size, own.model.nv)), np.zeros((own.size, own.model.nv))
             qpos[:, self.index.qpos], qvel[:, dof] = motion.position, motion.velocity
@@ -102,7 +106,8 @@ class InverseReplay(Replay):
             weight = _times(own.model, seen["M"], acceleration) + seen["qfrc_bias"]
             load[i] = weight[:, dof]
             total[i] = (weight - seen["qfrc_passive"])[:, dof]
-        return total, load
+        rotors = armature[:, None] * motion.acceleration
+        return total + rotors + damping[:, None] * motion.velocity, load + rotors
 
     def _tendon_friction(self, batch: BatchModel) -> FloatArray:
         """Torques (m, n, j) by dry friction of tendons that are sums of joints."""

@@ -22,7 +22,7 @@ ENERGY = 0.99
 """Fraction of the velocities' energy that lies in the band of the motion."""
 KINEMATIC, DYNAMIC = 10.0, 5.0
 """Band of the positions and of the torques, in bands of the motion."""
-GRID = 16.0
+GRID = 8.0
 """Samples of the grid in a period of the highest frequency of the torques."""
 ORDER = 4
 """Of the low-pass, before it is run forward and backward."""
@@ -102,19 +102,19 @@ class Kinematics:
         return replace(self, **{name: getattr(self, name)[start:stop] for name in names})
 
     def low_passed(self, torque: FloatArray) -> FloatArray:
-        """Torques (n, k) on this grid as they are compared."""
+        """Torques (..., n, k) on this grid as they are compared."""
         return low_pass(torque, self.cutoff, self.period)
 
 
 def low_pass(values: FloatArray, cutoff: float, period: float) -> FloatArray:
-    """Values (n, k) without what lies above a frequency (Hz), without phase."""
+    """Values (..., n, k) without what lies above a frequency (Hz), without phase."""
     if not cutoff < HIGHEST / 2 / period:
         return values
     from scipy.signal import butter, sosfiltfilt
 
     sos = butter(ORDER, cutoff, fs=1 / period, output="sos")
-    padding = min(int(3 / (cutoff * period)), len(values) - 1)
-    return np.asarray(sosfiltfilt(sos, values, axis=0, padlen=padding))
+    padding = min(int(3 / (cutoff * period)), values.shape[-2] - 1)
+    return np.asarray(sosfiltfilt(sos, values, axis=-2, padlen=padding))
 
 
 def motion_band(position: FloatArray, noise: FloatArray, period: float) -> float:

@@ -29,6 +29,7 @@ class DriveCoupling(Effect):
 
     name: ClassVar[str] = "drive_coupling"
     title: ClassVar[str] = "drive shared with the next joint"
+    needs: ClassVar[str] = "effort"
     variant: ClassVar[str] = "sum"
     with_next: ClassVar[float] = 1.0
     kinds: ClassVar[tuple[Kind, ...]] = (
