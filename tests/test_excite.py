@@ -25,11 +25,11 @@ from sysid_btr.excite.settings import MotionSettings
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.noise import NoiseFloor
 from sysid_btr.io.parquet import read_log
 from sysid_btr.io.validation import validate_file
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import joint_names
-from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
@@ -326,7 +326,8 @@ def test_the_verb_writes_a_log_to_play(tmp_path: Path, capsys: pytest.CaptureFix
     [
         (["--seconds", "1"], "--seconds"),
         (["--rate", "5"], "--rate"),
-        (["--noise", "-1"], "--noise"),
+        (["--noise", "position=-1"], "--noise"),
+        (["--noise", "effort=1"], "give position=SIGMA"),
         (["--margin", "0.5"], "--margin"),
         (["--max-velocity", "0"], "velocity"),
         (["--joints", "Elbow*"], "Elbow*"),

@@ -16,6 +16,7 @@ from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.noise import channel_noise
 from sysid_btr.io.parquet import write_log
 from sysid_btr.models.robot import Robot, robot_from_file
 from sysid_btr.simulation.numerics import Numerics
@@ -193,3 +194,25 @@ def test_a_log_without_commands_is_fitted_from_the_shell(
     assert "inverse dynamics" in shown.out
     assert "command.none" in shown.err
     assert "warning:" not in shown.err
+
+
+def test_noise_that_was_filtered_away_is_no_floor_and_can_be_stated(
+    arm: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = moved({"dof_frictionloss": (0.4, 0.25, 0.05)}, noise=(0.0, 0.0))
+    floor = channel_noise(log, "effort.elbow")
+    assert floor.method == "assumed"
+    assert floor.sigma == pytest.approx(np.ptp(log.channels["effort.elbow"]) / 2**20 / np.sqrt(12))
+    write_log(log, tmp_path / "arm.parquet")
+    asked = ["fit", "-m", str(arm.path), "-l", str(tmp_path / "arm.parquet"), "-f", "frictionloss:*"]
+    assert run([*asked, "--noise", "effort=0.02", "--noise", "position=2e-5"]) == 0
+    shown = capsys.readouterr()
+    assert "noise.filtered" not in shown.err
+    # in the band that is compared a part of the stated noise is left
+    assert "noise floor of 3." in shown.out.replace("\n", " ")
+    assert run(asked) == 0
+    assert "noise.filtered" in capsys.readouterr().err
+    assert run([*asked, "--noise", "efort=0.02"]) == 2
+    assert "did you mean effort?" in capsys.readouterr().err
+    assert run([*asked, "--noise", "effort=0"]) == 2
+    assert "above zero" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators import get_estimator
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
+from sysid_btr.io.noise import NoiseFloor
 from sysid_btr.objectives.distance import (
     DistanceProblem,
     MeanSquare,
@@ -25,7 +26,6 @@ from sysid_btr.objectives.distance import (
     information_distance,
     phi1,
 )
-from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import Target, make_targets
 from sysid_btr.simulation.replay import Replay

@@ -29,11 +29,11 @@ from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
+from sysid_btr.io.noise import NoiseFloor
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
 from sysid_btr.objectives.marginal import Marginal, projections
-from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments, on_slope

@@ -17,7 +17,7 @@ from sysid_btr.cli.groups import (
     ThreadOptions,
 )
 from sysid_btr.cli.inputs import check_freed, find_robot, read_logs
-from sysid_btr.cli.kinds import Names
+from sysid_btr.cli.kinds import Names, Numbers
 from sysid_btr.cli.options import option
 from sysid_btr.cli.terminal import print_json, remark
 from sysid_btr.errors import InterruptedRun, UsageError
@@ -37,11 +37,11 @@ class ExciteOptions(ModelOptions, LogOptions, ParameterOptions, SeedOptions, Thr
 
     seconds: float = option(MotionSettings.seconds, "Length of the motion.", metavar="S", decides=True)
     rate: float = option(MotionSettings.rate, "Samples per second.", metavar="HZ", decides=True)
-    noise: float | None = option(
-        None,
-        "Noise floor of the position sensors (rad, m).",
+    noise: Numbers = option(
+        {},
+        "Standard deviation of the position sensors' noise (rad, m): position=1e-4.",
         otherwise="the log's, else that of a 12-bit encoder",
-        metavar="RAD",
+        metavar="position=SIGMA",
         decides=True,
     )
     joints: Names = option((), "Joints that move.", otherwise="all with a servo", metavar="GLOB[,GLOB..]", decides=True)
@@ -133,7 +133,7 @@ def _search(options: ExciteOptions, robot: Robot, reference: Log | None) -> tupl
                 options.fit,
                 reference=reference,
                 motion=motion,
-                noise=options.noise,
+                noise=_position_noise(options.noise),
                 criterion=criterion,
                 estimator=estimator,
                 rng=generator(options.seed),
@@ -146,3 +146,10 @@ def _search(options: ExciteOptions, robot: Robot, reference: Log | None) -> tupl
         except Interrupted:
             raise InterruptedRun(keeper.interrupted(progress)) from None
     return found, keeper.folder
+
+
+def _position_noise(given: Numbers) -> float | None:
+    other = [name for name in given if name != "position"]
+    if other:
+        raise UsageError(f"--noise {other[0]}: excite plans by the positions alone; give position=SIGMA")
+    return given.get("position")

@@ -81,6 +81,13 @@ class StudyOptions(ModelOptions, LogOptions, ParameterOptions, ParamsOptions, Mo
         beside=True,
         decides=True,
     )
+    noise: Numbers = option(
+        {},
+        "Standard deviation of a channel's or column's noise (SI), e.g. position=1e-4.",
+        otherwise="as the logs state it, or read from them",
+        metavar="NAME=SIGMA",
+        decides=True,
+    )
     channels: Names = option(
         (),
         "Channels to fit: position, velocity, effort.",

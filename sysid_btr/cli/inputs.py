@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sysid_btr.cli.kinds import Holdout, Ranges
+from sysid_btr.cli.kinds import Holdout, Numbers, Ranges
 from sysid_btr.cli.terminal import remark
 from sysid_btr.errors import LogError, ModelError, UsageError
 
@@ -74,9 +74,25 @@ def read_logs(paths: Iterable[Path], *, motions: bool = False) -> list[Log]:
     return logs
 
 
-def read_holdout(given: Holdout) -> float | list[Log]:
+def read_holdout(given: Holdout, noise: Numbers) -> float | list[Log]:
     """The fraction, or the logs, that are not fitted."""
-    return read_logs(given) if isinstance(given, tuple) else given
+    return with_noise(read_logs(given), noise) if isinstance(given, tuple) else given
+
+
+def with_noise(logs: list[Log], noise: Numbers) -> list[Log]:
+    """The logs with the noise that the user states, over what they state themselves."""
+    from dataclasses import replace
+
+    from sysid_btr.io.log import with_hint
+
+    wrong = [f"{name}={value:g}" for name, value in noise.items() if not value > 0]
+    if wrong:
+        raise UsageError(f"--noise {', '.join(wrong)}: a standard deviation is above zero")
+    known = {part for log in logs for column in log.channels for part in (column, column.partition(".")[0])}
+    unknown = [name for name in noise if name not in known]
+    if unknown:
+        raise UsageError(f"--noise: no log has {', '.join(with_hint(name, known) for name in unknown)}")
+    return [replace(log, meta=replace(log.meta, noise={**log.meta.noise, **noise})) for log in logs]
 
 
 def warn_of(robot: Robot, logs: Iterable[Log]) -> None:

@@ -17,9 +17,9 @@ from sysid_btr.cli.options import Option, options_of
 from sysid_btr.cli.study_file import toml
 from sysid_btr.errors import ModelError, UsageError
 from sysid_btr.io.log import CHANNELS, Log
+from sysid_btr.io.noise import NoiseFloor, noise_floor
 from sysid_btr.models.robot import Robot, joint_names, servo_drives
 from sysid_btr.mujoco_conventions import FREE, slides
-from sysid_btr.objectives.noise import NoiseFloor, noise_floor
 from sysid_btr.objectives.targets import COMPARED, FITTED
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms

@@ -32,10 +32,10 @@ from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate, estimates
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.identify.study import measure_scales
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.noise import NoiseFloor
 from sysid_btr.io.split import split_episodes
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import slides
-from sysid_btr.objectives.noise import NoiseFloor
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.numerics import Numerics

@@ -23,9 +23,9 @@ from sysid_btr.floating_base.feet import touching_bodies
 from sysid_btr.floating_base.segments import FloatingReplay, starts_at, whole_step
 from sysid_btr.floating_base.size import BodySize
 from sysid_btr.io.log import Log
+from sysid_btr.io.noise import noise_floor
 from sysid_btr.mujoco_conventions import to_rotation
 from sysid_btr.objectives.covariance import Known, covariance
-from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid

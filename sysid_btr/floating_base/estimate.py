@@ -21,8 +21,8 @@ from sysid_btr.floating_base.feet import Foot, base_body, force_columns, points_
 from sysid_btr.floating_base.orientation import smooth_orientation, up_in_base
 from sysid_btr.floating_base.size import BodySize, measure_size
 from sysid_btr.floating_base.smoothing import Tracks, smooth, smooth_joints
+from sysid_btr.io.noise import noise_floor
 from sysid_btr.mujoco_conventions import to_quaternion
-from sysid_btr.objectives.noise import noise_floor
 
 if TYPE_CHECKING:
     import mujoco

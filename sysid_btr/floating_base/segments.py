@@ -14,8 +14,8 @@ from sysid_btr.floating_base.estimate import BaseState
 from sysid_btr.floating_base.initial_states import respond
 from sysid_btr.floating_base.size import BodySize
 from sysid_btr.io.log import Log
+from sysid_btr.io.noise import channel_noise
 from sysid_btr.models.robot import Robot, servo_joints
-from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
@@ -162,7 +162,7 @@ def segment_numerics(
         change = (runs[1].position - runs[0].position)[0]
         joints = replays[0].index.joints
         sigma = np.array(
-            [noise_floor(log.channels[f"position.{j}"]).sigma if log.has("position", j) else np.inf for j in joints]
+            [channel_noise(log, f"position.{j}").sigma if log.has("position", j) else np.inf for j in joints]
         )
         each = [float(np.sqrt(np.mean((change[a:b] / sigma) ** 2))) for a, b in few.rows]
         error = float(np.median(each))

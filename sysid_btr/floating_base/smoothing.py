@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.objectives.noise import noise_floor
+from sysid_btr.io.noise import noise_floor
 
 JERKS = np.logspace(0.5, 6.5, 13)
 """Root of the spectral density of a joint's jerk that is tried, rad s^-2.5 with the s of a Nao:

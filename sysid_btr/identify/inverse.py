@@ -12,9 +12,9 @@ from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.errors import ModelError
 from sysid_btr.identify.episode import Episode, Inflation, Procedure
 from sysid_btr.io.log import Log
+from sysid_btr.io.noise import NoiseFloor, channel_noise
 from sysid_btr.io.split import holdout_split
 from sysid_btr.models.robot import Robot, joint_names
-from sysid_btr.objectives.noise import NoiseFloor, noise_floor
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.inverse import InverseReplay
@@ -210,4 +210,4 @@ def _efforts(replay: InverseReplay) -> FloatArray:
 
 def _sigma(log: Log, column: str) -> float:
     """Standard deviation of a column's noise; nothing of one that is not logged."""
-    return noise_floor(log.channels[column]).sigma if column in log.channels else 0.0
+    return channel_noise(log, column).sigma if column in log.channels else 0.0

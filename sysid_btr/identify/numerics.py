@@ -9,8 +9,8 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError
+from sysid_btr.io.noise import channel_noise
 from sysid_btr.models.robot import Robot
-from sysid_btr.objectives.noise import noise_floor
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.replay import Replay
 
@@ -99,6 +99,6 @@ def _positions(robot: Robot, log: Log, numerics: Numerics, threads: int) -> dict
 def _change(log: Log, coarse: dict[str, FloatArray], fine: dict[str, FloatArray]) -> float:
     worst = []
     for joint, values in fine.items():
-        sigma = noise_floor(log.channels[f"position.{joint}"]).sigma
+        sigma = channel_noise(log, f"position.{joint}").sigma
         worst.append(np.sqrt(np.mean((values - coarse[joint]) ** 2)) / sigma)
     return float(np.max(worst)) if worst else 0.0

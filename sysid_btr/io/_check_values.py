@@ -10,6 +10,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.io._text import by_channel, places, runs
 from sysid_btr.io.log import Log
+from sysid_btr.io.noise import ASSUMED_BITS, channel_noise
 from sysid_btr.io.problem import Problem
 
 _NEEDED = ("command", "position")
@@ -76,6 +77,22 @@ def check_values(log: Log) -> Iterator[Problem]:
             f"values are missing (NaN), at most {100 * missing[worst]:.2g} % of a column ({worst}); "
             "they are not compared, and a missing command is replaced by the previous one (zero-order hold)",
             "nothing, if that is right; else repair the recorder",
+        )
+
+
+def check_noise(log: Log) -> Iterator[Problem]:
+    """Channels whose noise was filtered away before they were stored."""
+    measured = [name for name in log.channels if name.partition(".")[0] in ("position", "velocity", "effort")]
+    floors = {name: channel_noise(log, name) for name in measured}
+    filtered = [name for name, floor in floors.items() if floor.method == "assumed"]
+    if filtered:
+        yield Problem(
+            "noise.filtered",
+            "note",
+            by_channel(filtered),
+            f"hardly any noise is left: these values were filtered, computed or simulated; a {ASSUMED_BITS}-bit sensor "
+            f"is assumed, for {filtered[0]} a standard deviation of {floors[filtered[0]].sigma:.2g}",
+            "log what the sensor says, or state its noise: --noise position=1e-4, or `noise` in the file's metadata",
         )
 
 

@@ -226,6 +226,12 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
         isinstance(units, dict) and all(isinstance(unit, str) for unit in units.values()),
         'an object of channel and unit, e.g. {"position": "rad"}',
     )
+    noise = raw.get("noise")
+    accept(
+        "noise",
+        isinstance(noise, dict) and all(map(_positive, noise.values())),
+        'an object of channel or column and standard deviation (SI), e.g. {"position": 1e-4}',
+    )
     extra = {key: value for key, value in raw.items() if key not in META_KEYS}
     for key in extra:
         guess = closest(key, META_KEYS)

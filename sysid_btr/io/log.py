@@ -76,6 +76,9 @@ class LogMeta:
         Torque per ampere, Nm/A (N/A), of all joints or by joint: makes torques of logged currents.
     at : mapping of str to float, or str
         Where joints stand that are not logged, rad or m by joint, or ``"keyframe:NAME"`` of the model.
+    noise : mapping of str to float
+        Standard deviation of a sensor's noise, SI, by channel or by column, where it is known; else it is read from the
+        log.
     notes : str
         Free text.
     extra : mapping
@@ -94,8 +97,13 @@ class LogMeta:
     command_space: Literal["joint", "ctrl"] = "joint"
     torque_constant: float | Mapping[str, float] | None = None
     at: Mapping[str, float] | str = ""
+    noise: Mapping[str, float] = field(default_factory=dict)
     notes: str = ""
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def stated_noise(self, column: str) -> float | None:
+        """Stated standard deviation of a column's noise: its own entry, else its channel's, else None."""
+        return self.noise.get(column, self.noise.get(column.partition(".")[0]))
 
     def unit(self, column: str) -> str | None:
         """Declared unit of a column: its own entry, else its channel's, else None.

@@ -10,7 +10,7 @@ from sysid_btr.io._check_clock import check_clock
 from sysid_btr.io._check_columns import check_columns
 from sysid_btr.io._check_motion import check_motion
 from sysid_btr.io._check_units import check_declared_units, check_scale
-from sysid_btr.io._check_values import check_values, plausible
+from sysid_btr.io._check_values import check_noise, check_values, plausible
 from sysid_btr.io._file import load
 from sysid_btr.io._tracking import command_kinds, trackings
 from sysid_btr.io.log import Log
@@ -59,6 +59,7 @@ def validate_log(
         *check_columns(log, joints, drives, controls),
         *check_clock(log),
         *check_values(log),
+        *check_noise(motion),
         *check_declared_units(log),
         *check_scale(motion, tracking, ranges, kinds),
         *check_motion(motion, tracking, kinds),

@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import ModelError
-from sysid_btr.objectives.noise import NoiseFloor, noise_floor
+from sysid_btr.io.noise import NoiseFloor, channel_noise
 from sysid_btr.terms.base import Outputs
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _make_targets(log: Log, joints: tuple[str, ...], channels: tuple[str, ...], 
         if not names:
             continue
         measured = log.array(channel, names)
-        floor = tuple(noise_floor(measured[:, k]) for k in range(len(names)))
+        floor = tuple(channel_noise(log, f"{channel}.{name}") for name in names)
         mask = np.isfinite(measured) & (time >= min(warm_up, 0.1 * time[-1]))[:, None]
         if channel == "effort":
             mask[-1] = False  # the replay ends here: the command of this sample is not replayed

@@ -1,9 +1,12 @@
-"""Noise floor of each sensor from the log itself: what no model can explain.
+"""Noise floor of each sensor, stated or from the log itself: what no model can explain.
 
 Two estimates, the larger wins. High-frequency content: the motion of a robot is smooth on the scale of a
 few samples, so high-order differences of a sensor hold its white noise alone; cutting them at a multiple of
 their median keeps impacts and reversals out (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521). Quantisation:
 the smallest step between values, over the square root of 12, for sensors that stand still.
+
+Channels that were filtered before they were stored have next to no noise left, which says nothing of their error: where
+it is below what any converter resolves, that of a good sensor is assumed.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from typing import Literal
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.io.log import Log
 
 ORDERS = (3, 4, 5)
 """Orders of difference tried; the smallest estimate has the least motion left in it."""
@@ -22,6 +26,11 @@ MAD_TO_STD = 1.4826
 CLIP = 4.0
 """Differences beyond so many robust standard deviations are impacts or reversals, and are cut to that."""
 MIN_SAMPLES = 30
+FINEST_BITS = 24
+"""Over the range of its values in the log no sensor resolves more: the finest converters for drives have 24 bits."""
+ASSUMED_BITS = 20
+"""Resolution that is assumed of one whose noise was filtered away: that of a good encoder, so that nothing real hides
+below it."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +38,14 @@ class NoiseFloor:
     """Standard deviation of one sensor's noise, how it was found, and the sensor's step (0 if none)."""
 
     sigma: float
-    method: Literal["high-frequency", "quantisation", "unknown"]
+    method: Literal["high-frequency", "quantisation", "unknown", "assumed", "stated"]
     step: float
+
+
+def channel_noise(log: Log, column: str) -> NoiseFloor:
+    """Noise of a log's column: as the log's metadata state it, else from its values."""
+    stated, values = log.meta.stated_noise(column), log.channels[column]
+    return noise_floor(values) if stated is None else NoiseFloor(float(stated), "stated", quantisation_step(values))
 
 
 def noise_floor(values: FloatArray) -> NoiseFloor:
@@ -63,6 +78,9 @@ def noise_floor(values: FloatArray) -> NoiseFloor:
         most = max(CLIP * spread, 2 * step * gain / sqrt(6))
         estimates.append(float(np.sqrt(np.mean(np.minimum(moving, most) ** 2))) / gain)
     sigma = min(estimates) if estimates else 0.0
+    reach = float(np.ptp(finite))
+    if max(sigma, step / sqrt(12)) < reach * 2.0**-FINEST_BITS:
+        return NoiseFloor(reach * 2.0**-ASSUMED_BITS / sqrt(12), "assumed", step)
     if sigma <= step / sqrt(12):
         return NoiseFloor(max(step / sqrt(12), 1e-12), "quantisation", step)
     return NoiseFloor(sigma, "high-frequency", step)
