@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -56,13 +57,17 @@ class ServoLaw:
         stiffness, damping = bias[..., 1] * gear, bias[..., 2] * gear
         return cls(driven, gear, gain, constant, stiffness, damping, least, most, low, high)
 
+    @cached_property
+    def _clips(self) -> bool:
+        return bool(np.isfinite(self.most).any())
+
     def unlimited(self, command: FloatArray, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
         """Torque that the servos would like to give; all are (m, j), or (m, samples, j)."""
         every = len(self.driven) == self.low.shape[1]
         u, q, v = (x if every else x[..., self.driven] for x in (command, qpos, qvel))
         numbers = (self.gear, self.gain, self.constant, self.stiffness, self.damping)
         gear, gain, constant, stiffness, damping = numbers if u.ndim == 2 else (x[:, None] for x in numbers)
-        own: FloatArray = gain * (np.clip(u, self.least, self.most) if np.isfinite(self.most).any() else u)
+        own: FloatArray = gain * (np.clip(u, self.least, self.most) if self._clips else u)
         own += constant
         own += stiffness * q
         own += damping * v

@@ -83,7 +83,7 @@ class Setup:
         return found
 
 
-def as_ctrl(index: JointAddresses, joints: IntArray, command: FloatArray) -> FloatArray:
+def as_ctrl(index: JointAddresses, joints: IntArray | slice, command: FloatArray) -> FloatArray:
     """MuJoCo's ctrl for commands (..., k) of some joints, by their positions (k,) among all."""
     scale = index.scale[joints]
     return command if np.all(scale == 1) else command * scale
