@@ -174,6 +174,30 @@ def test_friction_that_follows_the_load_is_that_of_the_predicted_torque(arm: Rob
     assert {w for e in found.effects for w in e.where} == set(JOINTS)
 
 
+@pytest.mark.parametrize("joint", ["shoulder", "elbow"])
+def test_a_push_that_nobody_declared_is_found_with_its_time(arm: Robot, joint: str) -> None:
+    log = moved()
+    push = np.where((log.time > 3) & (log.time < 3.4), -0.6, 0.0)
+    pushed = {**log.channels, f"effort.{joint}": log.channels[f"effort.{joint}"] - push}
+    found = close(study_of(arm, replace(log, channels=pushed)), ["mass:hand"])
+    assert [(e.effect, e.where) for e in found.effects] == [("external_disturbance", (joint,))]
+    torque, start, duration = (p.value for p in found.effects[0].parameters)
+    assert torque == pytest.approx(-0.6, rel=0.05)
+    assert start == pytest.approx(3.0, abs=0.01)
+    assert duration == pytest.approx(0.4, abs=0.02)
+
+
+def test_what_no_effect_explains_is_described(arm: Robot) -> None:
+    log = moved()
+    own = 0.1 * log.channels["position.elbow"] ** 3
+    changed = {**log.channels, "effort.elbow": log.channels["effort.elbow"] + own}
+    found = close(study_of(arm, replace(log, channels=changed)), ["mass:hand"])
+    assert found.verdict == "unexplained"
+    assert found.signature is not None
+    assert found.signature["joints"][0]["joint"] == "elbow"
+    assert "a function of the position" in found.message
+
+
 def test_what_a_mode_cannot_do_is_said(arm: Robot) -> None:
     log = moved()
     still = replace(log, channels={n: v for n, v in log.channels.items() if not n.startswith("effort")})

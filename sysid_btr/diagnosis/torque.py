@@ -16,6 +16,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP, Target
+from sysid_btr.simulation.inverse import InverseReplay
 from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.disturbance import ExternalDisturbanceTrain
@@ -85,7 +86,9 @@ class MissingTorque:
 
 
 def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) -> tuple[MissingTorque, ...]:
-    """Deconvolve the position errors of a problem into torques, every measured joint of every episode.
+    """Torques that a problem's model lacks, at every measured joint of every episode.
+
+    Where torques are compared they are what is left; elsewhere position errors are deconvolved into them.
 
     Parameters
     ----------
@@ -100,11 +103,53 @@ def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) 
     """
     result: list[MissingTorque] = []
     for i, episode in enumerate(problem.episodes):
+        if isinstance(episode.replay, InverseReplay):
+            result += _compared(i, episode, episode.replay, values, scales)
+            continue
         target = next((t for t in episode.targets if t.channel == "position"), None)
         # segments are too short for the memory of a deconvolution
         if target is not None and episode.marginal is None:
             result += _deconvolve(i, episode, target, values, scales)
     return tuple(result)
+
+
+def _compared(
+    number: int, episode: Comparison, replay: InverseReplay, values: FloatArray, scales: Scales
+) -> list[MissingTorque]:
+    """What is left where torques themselves are compared."""
+    motion, outputs = replay.motion, replay.predict(values[None])
+    target = next(t for t in episode.targets if t.channel == "effort")
+    rows = np.flatnonzero(target.mask.any(axis=1))
+    keep = slice(int(rows[0]), int(rows[-1]) + 1)
+    predicted = target.predicted(outputs)[0]
+    error = target.measured - predicted
+    frequency = np.fft.rfftfreq(len(error), motion.period)
+    result = []
+    for k, joint in enumerate(target.joints):
+        column, mask = target.columns[k], target.mask[:, k]
+        white = error[:, k] / target.noise[k]
+        result.append(
+            MissingTorque(
+                joint=joint,
+                episode=number,
+                unit=scale_at(scales, joint).unit("Nm"),
+                period=motion.period,
+                time=motion.time[keep],
+                torque=error[keep, k],
+                noise=float(target.noise[k]),
+                residual=white[keep],
+                chi2=float(np.mean(white[mask] ** 2)) if mask.any() else 1.0,
+                position=motion.position[keep, column],
+                velocity=motion.velocity[keep, column],
+                acceleration=motion.acceleration[keep, column],
+                command=motion.position[keep, column],
+                servo=predicted[keep, k],
+                servo_measured=target.measured[keep, k],
+                frequency=frequency,
+                gain=motion.seen(frequency),
+            )
+        )
+    return result
 
 
 @dataclass(frozen=True, eq=False)

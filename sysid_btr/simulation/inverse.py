@@ -17,7 +17,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.simulation.kinematics import Kinematics
 from sysid_btr.simulation.mujoco_batch import VELOCITY, evaluate
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.simulation.setup import Law, Values, laws_of
+from sysid_btr.simulation.setup import Law, Values, laws_of, write_terms
 from sysid_btr.terms.base import BatchModel, Outputs, Step
 
 if TYPE_CHECKING:
@@ -43,13 +43,18 @@ class InverseReplay(Replay):
     kinematics: Kinematics | None = None
 
     @property
-    def _motion(self) -> Kinematics:
+    def motion(self) -> Kinematics:
+        """The kinematics that there must be."""
         if self.kinematics is None:
             raise ValueError("inverse dynamics need a motion")
         return self.kinematics
 
+    def batch(self, pairs: Values, size: int) -> BatchModel:
+        """The models of some candidates; a step is a sample of the motion."""
+        return write_terms(BatchModel(self.model, self.index, self.motion.period, size), pairs)
+
     def _run(self, candidates: FloatArray) -> Outputs:
-        pairs, m, motion = self._values(candidates), len(candidates), self._motion
+        pairs, m, motion = self._values(candidates), len(candidates), self.motion
         batch = self.batch(pairs, m)
         n, joints = motion.position.shape
         effort = np.empty((m, n, joints))
@@ -82,7 +87,7 @@ class InverseReplay(Replay):
 
         Candidates that differ in nothing of that share one computation.
         """
-        motion, dof = self._motion, self.index.dof
+        motion, dof = self.motion, self.index.dof
         shape = (batch.size, *motion.position.shape)
         total, load = np.empty(shape), np.empty(shape)
         found: dict[bytes, int] = {}
@@ -111,7 +116,7 @@ class InverseReplay(Replay):
 
     def _tendon_friction(self, batch: BatchModel) -> FloatArray:
         """Torques (m, n, j) by dry friction of tendons that are sums of joints."""
-        model, motion = batch.model, self._motion
+        model, motion = batch.model, self.motion
         total = np.zeros((1, 1, 1))
         friction = batch.read("tendon_frictionloss")
         for t in np.flatnonzero(friction.any(axis=0)):
@@ -121,7 +126,7 @@ class InverseReplay(Replay):
 
     def _applied(self, batch: BatchModel, pairs: Values) -> FloatArray:
         """Torques (m, n, j) known in advance."""
-        motion = self._motion
+        motion = self.motion
         borders = np.append(motion.time, motion.time[-1] + motion.period) - 0.5 * motion.period
         applied = np.zeros((1, 1, 1))
         for term, values in pairs:
@@ -132,7 +137,7 @@ class InverseReplay(Replay):
 
     def _under_laws(self, laws: tuple[Law, ...], candidate: int, torque: FloatArray, load: FloatArray) -> Step:
         """What laws of one candidate add; the samples stand where a rollout has its candidates."""
-        motion = self._motion
+        motion = self.motion
         n, joints = motion.position.shape
         step = Step(
             time=0.0,

@@ -101,6 +101,10 @@ class Kinematics:
         names = ("time", "position", "velocity", "acceleration")
         return replace(self, **{name: getattr(self, name)[start:stop] for name in names})
 
+    def seen(self, frequency: FloatArray) -> FloatArray:
+        """Fraction (f,) of a torque at each frequency (Hz) that is compared."""
+        return np.asarray(1 / (1 + (frequency / self.cutoff) ** (2 * ORDER)))
+
     def low_passed(self, torque: FloatArray) -> FloatArray:
         """Torques (..., n, k) on this grid as they are compared."""
         return low_pass(torque, self.cutoff, self.period)
