@@ -17,7 +17,7 @@ from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.noise import channel_noise
-from sysid_btr.io.parquet import write_log
+from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.models.robot import Robot, robot_from_file
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
@@ -218,6 +218,17 @@ def test_a_log_without_commands_is_fitted_from_the_shell(
     assert "inverse dynamics" in shown.out
     assert "command.none" in shown.err
     assert "warning:" not in shown.err
+
+
+def test_a_replay_of_a_log_without_commands_predicts_its_torques(
+    arm: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_log(moved(), tmp_path / "arm.parquet")
+    asked = ["replay", "-m", str(arm.path), "-l", str(tmp_path / "arm.parquet"), "--out", str(tmp_path / "out")]
+    assert run(asked) == 0
+    assert "effort error 3." in capsys.readouterr().out
+    predicted = read_log(tmp_path / "out" / "arm.replayed.parquet")
+    assert set(predicted.joints("effort")) == set(JOINTS)
 
 
 def test_noise_that_was_filtered_away_is_no_floor_and_can_be_stated(

@@ -10,7 +10,15 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sysid_btr.cli.groups import JsonOptions, LogOptions, ModelOptions, ParamsOptions, SimulatorOptions, ThreadOptions
+from sysid_btr.cli.groups import (
+    JsonOptions,
+    LogOptions,
+    ModelOptions,
+    ModeOptions,
+    ParamsOptions,
+    SimulatorOptions,
+    ThreadOptions,
+)
 from sysid_btr.cli.inputs import find_robot, read_logs, warn_of
 from sysid_btr.cli.kinds import Numbers
 from sysid_btr.cli.options import option
@@ -25,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayOptions(ModelOptions, LogOptions, ParamsOptions, SimulatorOptions, ThreadOptions, JsonOptions):
+class ReplayOptions(ModelOptions, LogOptions, ParamsOptions, ModeOptions, SimulatorOptions, ThreadOptions, JsonOptions):
     """Options of `replay`."""
 
     set: Numbers = option({}, "Change the model first, e.g. 'kp:*=0.9'.", metavar="PARAMETERS=VALUE", decides=False)
@@ -81,8 +89,9 @@ def _compare(
 ) -> None:
     """Compare the model's sensors with the logs'."""
     from sysid_btr.display.text import console, joints_table, show
+    from sysid_btr.identify.mode import Mode
     from sysid_btr.identify.outcome import replay_result
-    from sysid_btr.identify.replay import replay_log
+    from sysid_btr.identify.replay import predicted_log, replay_log
     from sysid_btr.identify.scores import score_problem
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import write_log
@@ -90,11 +99,22 @@ def _compare(
 
     threads = options.threads
     study = make_study(
-        robot, logs, holdout=logs, channels=COMPARED, numerics=numerics, simulator=options.simulator, threads=threads
+        robot,
+        logs,
+        holdout=logs,
+        channels=COMPARED,
+        numerics=numerics,
+        simulator=options.simulator,
+        mode=Mode(options.mode),
+        threads=threads,
     )
     scores = score_problem(study.train_problem(model), model.values)
     for path, one in zip(targets, logs, strict=False):
-        predicted = replay_log(robot, one, model, numerics=study.numerics, threads=threads)
+        own = [episode for episode in study.train if episode.log.path == one.path]
+        if all(episode.procedure.replayed for episode in own):
+            predicted = replay_log(robot, one, model, numerics=study.numerics, threads=threads)
+        else:
+            predicted = predicted_log(own, model, study.numerics, threads=threads)
         write_log(predicted, path, overwrite=options.overwrite)
     result = replay_result(study, scores, dict(options.set), time.perf_counter() - began)
     if options.json:

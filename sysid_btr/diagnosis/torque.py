@@ -123,7 +123,7 @@ def _compared(
     keep = slice(int(rows[0]), int(rows[-1]) + 1)
     predicted = target.predicted(outputs)[0]
     error = target.measured - predicted
-    frequency = np.fft.rfftfreq(len(error), motion.period)
+    frequency = np.asarray(np.fft.rfftfreq(len(error), motion.period), dtype=np.float64)
     result = []
     for k, joint in enumerate(target.joints):
         column, mask = target.columns[k], target.mask[:, k]

@@ -33,7 +33,8 @@ class InverseProcedure(Procedure):
 
     refines_step: ClassVar[bool] = False
     moves_split: ClassVar[bool] = False
-    no_torque: ClassVar[str] = "its torques are compared directly"
+    replayed: ClassVar[bool] = False
+    no_torque: ClassVar[str] = "too little of it moves"
 
 
 @dataclass(frozen=True, eq=False)

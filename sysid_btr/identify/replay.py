@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.numerics import choose_numerics
+from sysid_btr.io.log import Log
 from sysid_btr.io.split import split_episodes
 from sysid_btr.models.log_checks import require_drives
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
@@ -20,7 +21,7 @@ from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
-    from sysid_btr.io.log import Log
+    from sysid_btr.identify.episode import Episode
     from sysid_btr.models.robot import Robot
 
 
@@ -86,6 +87,39 @@ def replay_log(
         meta=replace(log.meta, source=f"replayed: {robot.name}, {chosen}", units={}),
         path=None,
         unknown={},
+    )
+
+
+def predicted_log(episodes: Sequence[Episode], model: Model, numerics: Numerics, *, threads: int = 0) -> Log:
+    """What the sensors would have shown, as these episodes are compared with a model.
+
+    Parameters
+    ----------
+    episodes : of one recording.
+    model, numerics : terms with values; integrator and step.
+
+    Returns
+    -------
+    Log
+        On the episodes' own clocks; NaN where nothing is predicted.
+    """
+    parts = []
+    for number, episode in enumerate(episodes):
+        run = episode.replay(model.terms, numerics, effort=True, threads=threads)
+        outputs = run.predict(model.values[None])
+        channels = {}
+        for i, joint in enumerate(run.index.joints):
+            channels[f"position.{joint}"] = outputs.position[0, :, i]
+            channels[f"velocity.{joint}"] = outputs.velocity[0, :, i]
+            if outputs.effort is not None:
+                channels[f"effort.{joint}"] = outputs.effort[0, :, i]
+        own = replace(episode.log.meta, source=f"predicted: {episode.robot.name}", units={})
+        parts.append(Log(episode.log.time, channels, own, np.full(len(episode.log), number)))
+    return replace(
+        parts[0],
+        time=np.concatenate([part.time for part in parts]),
+        channels={name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels},
+        episode=np.concatenate([part.episode for part in parts]),
     )
 
 
