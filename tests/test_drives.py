@@ -290,3 +290,53 @@ def test_torques_are_neither_degrees_nor_late_nor_dead() -> None:
     assert [p for p in check_log(arm(ACTUATORS["torque"]), log) if p.severity != "note"] == []
     alone = replace(log, meta=replace(log.meta, drive="torque"))
     assert [p for p in validate_log(alone) if p.severity != "note"] == []
+
+
+# --- joints that are not logged ---------------------------------------------------------------------------
+
+FINGERS = """
+<equality><joint joint1="elbow" joint2="shoulder" polycoef="0.1 2 0 0 0"/></equality>
+<actuator><position name="shoulder" joint="shoulder" kp="30" kv="1"/></actuator>
+<keyframe><key name="closed" qpos="0.3 0.7"/><key name="open" qpos="-0.1 -0.1"/></keyframe>
+"""
+
+
+def start(robot: Robot, log: Log) -> dict[str, float]:
+    replay = Replay(robot, log, (), NUMERICS)
+    return dict(zip(replay.index.joints, replay.start[0], strict=True))
+
+
+def test_a_joint_that_is_not_logged_stands_where_it_is_said_to() -> None:
+    more = ACTUATORS["position"].format(j="shoulder") + ACTUATORS["position"].format(j="elbow")
+    keys = '<keyframe><key name="a" qpos="0.3 0.7"/><key name="b" qpos="0.1 0.2"/></keyframe>'
+    robot = robot_from_xml(ARM.format(more=f"<actuator>{more}</actuator>{keys}"))
+    log = commands(command__shoulder=0.3 + WAVE, position__shoulder=0.3 + 0 * TIME)
+    assert start(robot, log)["elbow"] == 0.7
+    in_metadata = replace(log, meta=replace(log.meta, at="keyframe:b"))
+    assert start(robot, in_metadata)["elbow"] == 0.2
+    assert start(robot, in_metadata)["shoulder"] == pytest.approx(0.3)
+    assert start(replace(robot, at=(("elbow", -0.4),)), in_metadata)["elbow"] == -0.4
+    (note,) = [p for p in check_log(robot, log) if p.code == "joint.unlogged"]
+    assert (note.severity, note.where) == ("note", "elbow at 0.7")
+    with pytest.raises(ModelError, match="no joint wrist"):
+        start(replace(robot, at=(("wrist", 1.0),)), log)
+    with pytest.raises(ModelError, match="its keyframes: a, b"):
+        start(replace(robot, at=(("keyframe:c", 0.0),)), log)
+
+
+def test_a_servo_without_a_command_holds_its_joint_where_it_stands() -> None:
+    robot = replace(arm(ACTUATORS["position"].replace('kp="30"', 'kp="3000"')), at=(("elbow", 0.5),))
+    found = only(commands(command__shoulder=0 * TIME, position__shoulder=0 * TIME), robot)
+    assert np.abs(found[:, 1] - 0.5).max() < 2e-3
+
+
+def test_a_coupled_joint_starts_and_moves_with_the_one_it_follows() -> None:
+    robot = robot_from_xml(ARM.format(more=FINGERS))
+    log = commands(command__shoulder=0.3 + WAVE, position__shoulder=0.3 + 0.5 * TIME)
+    replay = Replay(robot, log, (), NUMERICS)
+    (q, v) = replay.start
+    assert q[1] == pytest.approx(0.1 + 2 * 0.3, abs=1e-9)
+    assert v[1] == pytest.approx(2 * 0.5, abs=1e-6)
+    moved = replay.predict(np.zeros((1, 0))).position[0]
+    # MuJoCo's couplings are soft
+    assert np.abs(moved[:, 1] - 0.1 - 2 * moved[:, 0]).max() < 0.02

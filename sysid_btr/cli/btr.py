@@ -104,7 +104,7 @@ def btr(options: BtrOptions) -> int:
     from sysid_btr.result import exit_code
     from sysid_btr.terms.grammar import parse_parameters
 
-    model = find_robot(options.model, options.bounds)
+    model = find_robot(options, options.bounds)
     check_freed(model, options.fit)
     if options.resume and options.out is None:
         raise UsageError("--resume continues from the journals of an earlier run: give its --out folder")

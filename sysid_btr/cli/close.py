@@ -42,7 +42,7 @@ def close(options: CloseOptions) -> int:
     from sysid_btr.diagnosis.close import close as close_loop
     from sysid_btr.terms.library import select_effects
 
-    robot = find_robot(options.model, options.bounds)
+    robot = find_robot(options, options.bounds)
     select_effects(options.effects)
     options = replace(options, fit=declared(robot, options.fit))
 

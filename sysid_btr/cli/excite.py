@@ -84,7 +84,7 @@ def excite(options: ExciteOptions) -> int:
     from sysid_btr.result import exit_code
     from sysid_btr.saving import save_motion
 
-    robot = find_robot(options.model, options.bounds)
+    robot = find_robot(options, options.bounds)
     check_freed(robot, options.fit)
     if options.out is None:
         raise UsageError("--out DIR is required: the folder for the motion")

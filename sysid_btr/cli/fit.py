@@ -41,7 +41,7 @@ def fit(options: FitOptions) -> int:
     """
     from sysid_btr.identify.profile import chosen_names, with_profiles
 
-    robot = find_robot(options.model, options.bounds)
+    robot = find_robot(options, options.bounds)
     check_freed(robot, options.fit)
     search = search_of(options, robot, options.max_evaluations)
 

@@ -18,6 +18,19 @@ class ModelOptions(Options):
     model: str | None = option(
         None, "Built-in robot, or an MJCF or URDF file.", short="-m", metavar="NAME|FILE", beside=True, decides=True
     )
+    servo: Names = option(
+        (),
+        "Position servos for joints that have none, in the place of motors.",
+        metavar="kp=GAIN[,kv=GAIN]",
+        decides=True,
+    )
+    at: Names = option(
+        (),
+        "Where joints stand that are not logged, rad or m.",
+        otherwise="the log's metadata, the model's first keyframe, or zero",
+        metavar="JOINT=VALUE|keyframe:NAME[,..]",
+        decides=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

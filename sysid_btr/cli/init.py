@@ -31,7 +31,7 @@ def init(options: InitOptions) -> int:
     from sysid_btr.cli.proposal import study_file
     from sysid_btr.run_folder import Folder
 
-    robot = find_robot(options.model)
+    robot = find_robot(options)
     logs = read_logs(options.files)
     target = output_file(options.out, options.files, options.overwrite)
     warn_of(robot, logs)

@@ -6,31 +6,64 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sysid_btr.cli.kinds import Holdout, Numbers, Ranges
+from sysid_btr.cli.groups import ModelOptions
+from sysid_btr.cli.kinds import Holdout, Numbers, Ranges, number
 from sysid_btr.cli.terminal import remark
 from sysid_btr.errors import LogError, ModelError, UsageError
 
 if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.io.log import Log
+    from sysid_btr.models.actuation import Servo
     from sysid_btr.models.robot import Robot
     from sysid_btr.terms.base import Parameter
 
 
-def find_robot(name: str | None, bounds: Ranges | None = None) -> Robot:
-    """The robot called for, with the bounds given to its parameters."""
+def find_robot(options: ModelOptions, bounds: Ranges | None = None) -> Robot:
+    """The robot called for, with the bounds given to its parameters; what was changed of its file is told."""
     from dataclasses import replace
 
+    from sysid_btr.models.actuation import with_servos
     from sysid_btr.models.builtin import BUILTIN, load_robot
+
+    name = options.model
 
     if name is None:
         built_in = f" ({', '.join(sorted(BUILTIN))})" if BUILTIN else ""
         raise UsageError(f"which robot? Give --model: a built-in name{built_in} or an MJCF or URDF file")
-    robot = load_robot(name)
+    robot = replace(load_robot(name), at=_positions(options.at))
+    if options.servo:
+        robot = with_servos(robot, _servo(options.servo))
+    for said in robot.remarks:
+        remark(f"note: {name}: {said}")
     if not bounds:
         return robot
     _check_names(robot, bounds)
     return replace(robot, bounds={**robot.bounds, **bounds})
+
+
+def _positions(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Joints and where they stand; a keyframe with zero."""
+    from sysid_btr.models.pose import KEYFRAME
+
+    return tuple((text, 0.0) if text.startswith(KEYFRAME) else _equation("--at", text) for text in given)
+
+
+def _servo(given: Sequence[str]) -> Servo:
+    from sysid_btr.models.actuation import Servo
+
+    gains = dict(_equation("--servo", text) for text in given)
+    if not {"kp"} <= gains.keys() <= {"kp", "kv"} or min(gains.values()) < 0 or gains["kp"] == 0:
+        raise UsageError(f"--servo {','.join(given)}: give kp above zero, and kv, as in --servo kp=100,kv=5")
+    return Servo(**gains)
+
+
+def _equation(flag: str, text: str) -> tuple[str, float]:
+    name, equals, value = text.partition("=")
+    found = number(value)
+    if not (name and equals) or found is None:
+        raise UsageError(f"{flag} {text}: expected NAME=NUMBER")
+    return name, found
 
 
 def _check_names(robot: Robot, bounds: Iterable[str]) -> None:

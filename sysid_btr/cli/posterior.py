@@ -63,7 +63,7 @@ def posterior(options: PosteriorOptions) -> int:
     from sysid_btr.posterior.sampling import Settings
 
     check_installed()
-    robot = find_robot(options.model, options.bounds)
+    robot = find_robot(options, options.bounds)
     check_freed(robot, options.fit)
     search = search_of(options, robot, None)
     budget = BUDGET if options.max_evaluations is None else Budget(evaluations=options.max_evaluations)

@@ -47,7 +47,7 @@ def replay(options: ReplayOptions) -> int:
     A motion that was not recorded yet (excite.parquet) is only played: where every joint goes, and the predicted log.
     """
     began = time.perf_counter()
-    robot = find_robot(options.model)
+    robot = find_robot(options)
     logs = read_logs(options.log, motions=True)
     model, numerics = _changed(robot, options)
     targets = _targets(options.out, logs, options.overwrite)

@@ -31,7 +31,7 @@ def validate(options: ValidateOptions) -> int:
     paths = [*options.files, *options.log]
     if not paths:
         raise UsageError("which log? Give one or more files: sysid-btr validate walk.parquet")
-    check = None if options.model is None else partial(check_log, find_robot(options.model))
+    check = None if options.model is None else partial(check_log, find_robot(options))
     found = {path: validate_file(path, check=check) for path in paths}
     if options.json:
         print_json({str(path): problems for path, problems in found.items()})

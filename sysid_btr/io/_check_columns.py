@@ -15,11 +15,16 @@ MOVERS = ("command_velocity", "command_effort", "effort", "current")
 
 
 def check_columns(
-    log: Log, joints: Sequence[str] | None, drives: Mapping[str, str] | None = None, controls: Sequence[str] = ()
+    log: Log,
+    joints: Sequence[str] | None,
+    drives: Mapping[str, str] | None = None,
+    controls: Sequence[str] = (),
+    at: Mapping[str, float] | None = None,
 ) -> Iterator[Problem]:
     """Names of columns: misspelled, of no channel, without their partner, missing or unknown to the model.
 
-    `drives` has the joints that the model drives, where it is known, and `controls` its actuators of other things.
+    `drives` has the joints that the model drives, where it is known, `controls` its actuators of other things, and `at`
+    where joints start that are not logged.
     """
     misspelled = _misspelled(log, joints or ())
     for column, meant in misspelled.items():
@@ -33,7 +38,7 @@ def check_columns(
     yield from _strange_channels(log, misspelled)
     yield from _pairs(log, misspelled, drives, controls)
     if joints is not None:
-        yield from _against_model(log, joints, misspelled, controls)
+        yield from _against_model(log, joints, misspelled, controls, at or {})
 
 
 def log_joints(log: Log) -> tuple[str, ...]:
@@ -173,7 +178,7 @@ def _all_columns(log: Log) -> list[str]:
 
 
 def _against_model(
-    log: Log, joints: Sequence[str], misspelled: dict[str, str], controls: Sequence[str]
+    log: Log, joints: Sequence[str], misspelled: dict[str, str], controls: Sequence[str], at: Mapping[str, float]
 ) -> Iterator[Problem]:
     there = log_joints(log)
     meant = {column.partition(".")[2] for column in misspelled.values()}
@@ -205,7 +210,7 @@ def _against_model(
         yield Problem(
             "joint.unlogged",
             "note",
-            some(missing),
+            some(f"{name} at {at[name]:.4g}" if name in at else name for name in missing),
             "these joints of the model are not logged: they start where the keyframe, --at or the metadata say, at "
             "zero otherwise, and move with what couples them to others",
             "nothing, if they are passive, coupled or idle; else log them too",

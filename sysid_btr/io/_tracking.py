@@ -86,6 +86,14 @@ def command_kinds(log: Log, drives: Mapping[str, str]) -> dict[str, str]:
     }
 
 
+def distance(pair: Tracking) -> float:
+    """Root mean square distance of position and command at a servo's lag, of the command's standard deviation."""
+    lags = range(round(_NORMAL_LAG / pair.step) + 1)
+    pairs = [pair.at_lag(lag) for lag in lags]
+    found = [float(np.sqrt(np.mean((p - c) ** 2)) / np.std(c)) for c, p in pairs if len(c) and np.ptp(c) > 0]
+    return min(found, default=np.inf)
+
+
 def trackings(log: Log, joints: Sequence[str]) -> Mapping[str, Tracking]:
     """Those joints that have both command and position, on a regular clock of at most 100 Hz."""
     interval = typical_interval(log.time[np.isfinite(log.time)])

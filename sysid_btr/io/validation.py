@@ -26,6 +26,7 @@ def validate_log(
     ranges: Mapping[str, tuple[float, float]] | None = None,
     drives: Mapping[str, str] | None = None,
     controls: Sequence[str] = (),
+    at: Mapping[str, float] | None = None,
 ) -> tuple[Problem, ...]:
     """Problems of a log's content.
 
@@ -44,6 +45,8 @@ def validate_log(
         What a command of a joint is to the model; without it, what the log's metadata say, else a position.
     controls : sequence of str
         Actuators of the model that are commanded by their own name.
+    at : mapping of str to float, optional
+        Where joints of the model start that are not logged, rad or m.
 
     Returns
     -------
@@ -56,7 +59,7 @@ def validate_log(
     kinds = command_kinds(log, drives or {})
     tracking = trackings(motion, [joint for joint, kind in kinds.items() if kind == "position"])
     found = [
-        *check_columns(log, joints, drives, controls),
+        *check_columns(log, joints, drives, controls, at),
         *check_clock(log),
         *check_values(log),
         *check_noise(motion),

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sysid_btr.errors import ModelError
+from sysid_btr.models.actuation import with_motors
 from sysid_btr.models.ant import ant
 from sysid_btr.models.emps import emps
 from sysid_btr.models.nao import nao, nao_table1
 from sysid_btr.models.robot import Robot, robot_from_file
+from sysid_btr.models.urdf import is_urdf
 from sysid_btr.models.xl330 import xl330
 
 BUILTIN: dict[str, Callable[[], Robot]] = {
@@ -22,7 +24,7 @@ BUILTIN: dict[str, Callable[[], Robot]] = {
 
 
 def load_robot(name: str) -> Robot:
-    """A built-in robot by name, or any MJCF or URDF by path.
+    """A built-in robot by name, or any MJCF or URDF by path; a URDF without actuators with torque motors.
 
     Raises
     ------
@@ -38,4 +40,5 @@ def load_robot(name: str) -> Robot:
             f"model {name!r}: neither a built-in model ({listing}) nor an existing file. "
             "Give one of these names, or the path of an MJCF or URDF file."
         )
-    return robot_from_file(path)
+    robot = robot_from_file(path)
+    return with_motors(robot) if is_urdf(path.read_bytes()) else robot

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sysid_btr.errors import ModelError
+from sysid_btr.models.urdf import is_urdf, read_urdf
 from sysid_btr.mujoco_conventions import SINGLE, slides
 from sysid_btr.terms.base import Scope, Term
 from sysid_btr.terms.drives import Drive, joint_drives
@@ -38,6 +39,9 @@ class Robot:
     tied : groups of joints driven by one motor; their gains are one parameter.
     always : terms without parameters of their own that belong to the robot (drive electronics).
     fields : ``FIELD`` -> term of the parameters that this robot has beyond those of the grammar.
+    at : joints with the positions at which they stand, and ``keyframe:NAME`` with any number for all, in the order in
+        which they were told; for what a log does not measure.
+    remarks : what of its file was left out, assumed or added; empty where the model is the file's own.
     """
 
     name: str
@@ -50,6 +54,8 @@ class Robot:
     configure: Callable[[Robot, Log], Robot] | None = None
     priors: Mapping[str, str] = field(default_factory=dict)
     fields: Mapping[str, type[Term]] = field(default_factory=dict)
+    at: tuple[tuple[str, float], ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import facts_html
@@ -62,13 +68,15 @@ class Robot:
         }
         return facts_html(f"robot {self.name}", facts)
 
-    def to_dict(self) -> dict[str, str | None]:
-        """Name, file and digest, as results have them."""
-        return {"name": self.name, "path": None if self.path is None else str(self.path), "sha256": self.digest}
+    def to_dict(self) -> dict[str, Any]:
+        """Name, file and digest, as results have them, and what was changed of the file."""
+        remarks = {"remarks": list(self.remarks)} if self.remarks else {}
+        path = None if self.path is None else str(self.path)
+        return {"name": self.name, "path": path, "sha256": self.digest, **remarks}
 
     def for_log(self, log: Log) -> Robot:
         """The robot as this log's metadata describes it (servo registers, supply, load)."""
-        return self if self.configure is None else self.configure(self, log)
+        return self if self.configure is None else replace(self.configure(self, log), at=self.at)
 
     def names(self, scope: Scope) -> tuple[str, ...]:
         """Names that a term of this scope can have as its places, in model order."""
@@ -107,9 +115,6 @@ def robot_from_file(path: Path) -> Robot:
     """Any MJCF or URDF as a robot."""
     import mujoco
 
-    def make_spec() -> mujoco.MjSpec:
-        return mujoco.MjSpec.from_file(str(path))
-
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -119,6 +124,19 @@ def robot_from_file(path: Path) -> Robot:
             f"model {path}: this is not an XML file, so it is neither MJCF nor URDF. Give the robot's model with "
             "--model, and a log with --log"
         )
+    urdf = read_urdf(path, content) if is_urdf(content) else None
+
+    def make_spec() -> mujoco.MjSpec:
+        if urdf is None:
+            return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_string(urdf.text)
+        spec.modelfiledir = str(path.parent)
+        return spec
+
+    if urdf is None and path.suffix != path.suffix.lower():
+        raise ModelError(
+            f"model {path}: MuJoCo reads no {path.suffix}: rename the file to end in {path.suffix.lower()}"
+        )
     try:
         make_spec().compile()
     except (ValueError, OSError) as error:
@@ -126,7 +144,8 @@ def robot_from_file(path: Path) -> Robot:
             f"model {path}: MuJoCo cannot read it: {error}. Give an MJCF or URDF file that MuJoCo's own viewer opens "
             "(python -m mujoco.viewer --mjcf=FILE), meshes and included files beside it"
         ) from error
-    return Robot(name=path.stem, make_spec=make_spec, path=path, digest=_digest(content))
+    remarks = () if urdf is None else urdf.remarks
+    return Robot(name=path.stem, make_spec=make_spec, path=path, digest=_digest(content), remarks=remarks)
 
 
 def robot_from_spec(name: str, make_spec: Callable[[], mujoco.MjSpec], **known: object) -> Robot:

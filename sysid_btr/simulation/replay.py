@@ -15,6 +15,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.models.commands import commanded
+from sysid_btr.models.pose import standing
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.compiling import compile_model, made_elsewhere, make_index
 from sysid_btr.simulation.grid import Grid, at_samples, make_grid, step_inputs
@@ -24,7 +25,7 @@ from sysid_btr.simulation.servo import ServoLaw
 from sysid_btr.simulation.setup import Setup, Values, prepare, write_terms
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.simulation.simulator import States
-from sysid_btr.simulation.start import initial_state
+from sysid_btr.simulation.start import coupled_state, initial_state
 from sysid_btr.terms.base import BatchModel, JointAddresses, Outputs, Parameter, Term
 
 if TYPE_CHECKING:
@@ -87,7 +88,11 @@ class Replay:
     @cached_property
     def start(self) -> tuple[FloatArray, FloatArray]:
         """Initial positions and velocities of the joints, (j,) each."""
-        return initial_state(self.log, self.index.joints, self.model.qpos0[self.index.qpos])
+        joints, at = self.index.joints, standing(self.robot, self.log)
+        defaults = np.array([at.get(j, q) for j, q in zip(joints, self.model.qpos0[self.index.qpos], strict=True)])
+        start = initial_state(self.log, joints, defaults)
+        unlogged = np.array([not self.log.has("position", joint) for joint in joints], dtype=bool)
+        return coupled_state(self.model, self.index, *start, unlogged)
 
     @cached_property
     def idle(self) -> tuple[FloatArray, dict[str, float]]:

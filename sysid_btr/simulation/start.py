@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
+    import mujoco
+
     from sysid_btr.io.log import Log
+    from sysid_btr.terms.base import JointAddresses
 
 FIT_SAMPLES = 7
 """Samples of the polynomial whose value and slope are the start."""
+
+ROUNDS, CLOSED = 30, 1e-10
+"""Iterations that close loops of joints, and the error in m or rad at which they are closed."""
 
 
 def initial_state(log: Log, joints: tuple[str, ...], defaults: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -37,6 +44,36 @@ def initial_state(log: Log, joints: tuple[str, ...], defaults: FloatArray) -> tu
         if log.has("velocity", joint) and np.isfinite(log.channels[f"velocity.{joint}"][0]):
             qvel[i] = log.channels[f"velocity.{joint}"][0]
     return qpos, qvel
+
+
+def coupled_state(
+    model: mujoco.MjModel, index: JointAddresses, qpos: FloatArray, qvel: FloatArray, moved: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Positions and velocities (j,) of the joints with those that are `moved` as the model's equalities want them.
+
+    Gauss-Newton on MuJoCo's own equality constraints, which hold couplings of joints and tendons and closed loops; of
+    joints that no equality reaches nothing changes.
+    """
+    import mujoco
+
+    if not model.neq or not moved.any():
+        return qpos, qvel
+    own = copy.copy(model)
+    own.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    data, own_dof = mujoco.MjData(own), index.dof[moved]
+    data.qpos[index.qpos], data.qvel[index.dof] = qpos, qvel
+    for _ in range(ROUNDS):
+        mujoco.mj_fwdPosition(own, data)
+        rows = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+        jacobian, violation = data.efc_J.reshape(-1, own.nv)[rows], data.efc_pos[rows]
+        if not np.any(np.abs(violation) > CLOSED):
+            break
+        data.qpos[index.qpos[moved]] += np.linalg.lstsq(jacobian[:, own_dof], -violation, rcond=None)[0]
+    data.qvel[own_dof] = 0.0
+    speed = np.linalg.lstsq(jacobian[:, own_dof], -jacobian @ data.qvel, rcond=None)[0]
+    reached = np.any(jacobian[:, own_dof] != 0, axis=0)
+    data.qvel[own_dof] = np.where(reached, speed, qvel[moved])
+    return data.qpos[index.qpos].copy(), data.qvel[index.dof].copy()
 
 
 def _value_and_slope(time: FloatArray, values: FloatArray) -> tuple[float, float]:

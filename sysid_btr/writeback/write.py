@@ -138,7 +138,7 @@ def draft(model: Identified) -> Draft:
     robot = study.robot.for_log(log)
     target = make_target(robot, log, _parts(model), study.numerics)
     why = ""
-    if robot.path is not None and _is_mjcf(robot.path):
+    if robot.path is not None and not robot.remarks and _is_mjcf(robot.path):
         try:
             return _draft_in(own_source(robot.path), model, robot, target)
         except (ValueError, OSError) as error:
