@@ -231,6 +231,22 @@ def test_a_replay_of_a_log_without_commands_predicts_its_torques(
     assert set(predicted.joints("effort")) == set(JOINTS)
 
 
+def test_bounds_that_nobody_stated_grow_and_stated_ones_are_said(arm: Robot) -> None:
+    heavy = mujoco.MjModel.from_xml_string(ARM)
+    mass, inertia = heavy.body_mass.copy(), heavy.body_inertia.copy()
+    mass[3], inertia[3] = 5 * mass[3], 5 * inertia[3]
+    log = moved({"body_mass": mass, "body_inertia": inertia})
+    found = fit(study_of(arm, log), ["mass:hand"]).estimates[0]
+    assert found.value == pytest.approx(5.0, rel=0.01)
+    assert found.bounds[1] == 15.0
+    stated = replace(arm, bounds={"mass": (0.5, 3.0)})
+    held = fit(study_of(stated, log), ["mass:hand"]).estimates[0]
+    assert held.value == pytest.approx(3.0)
+    assert held.at_bound
+    assert held.identifiable != "no"
+    assert held.reason == "the estimate lies on the stated bound 0.5 .. 3"
+
+
 def test_noise_that_was_filtered_away_is_no_floor_and_can_be_stated(
     arm: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,6 +15,7 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, si
 from sysid_btr.estimators.chain import Chain, needs_residuals
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
+from sysid_btr.identify.bounds import grow_bounds
 from sysid_btr.identify.coarse import realise_servo, weigh_columns
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fixing import fix_unidentifiable
@@ -160,6 +161,8 @@ def fit(
     study, replays = solved.study, solved.replays
     at = Optimum.of(solved.problem, solved.result, study.stencil(terms))
     if solved.by_residuals:
+        at, spent = grow_bounds(study, at, rng, budget.after(replays), progress)
+        model, replays = at.problem.model, replays + spent
         study, at, shift, spent = with_short_steps(study, model, at, rng, budget.after(replays), progress)
         replays += spent
     else:

@@ -125,6 +125,10 @@ def estimates(
         span = parameter.upper - parameter.lower
         at_bound = bool(min(value - parameter.lower, parameter.upper - value) <= 1e-6 * span)
         state, reason = identifiability(i, parameters, std, norm, cov, span)
+        if at_bound and parameter.stated:
+            # the bound that was stated is what is known of it
+            state = "weak" if state == "no" else state
+            reason = f"the estimate lies on the stated bound {parameter.lower:g} .. {parameter.upper:g}"
         low = max(float(value) - float(quantile[i] * std[i]), parameter.lower)
         high = min(float(value) + float(quantile[i] * std[i]), parameter.upper)
         result.append(

@@ -36,6 +36,7 @@ class Parameter:
     nominal : value at which the model is exactly the plain one.
     lower, upper : bounds of the search.
     scale : size of a change that matters (finite differences, starts, scans).
+    stated : whether the bounds are the user's or the robot's, which do not grow.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Parameter:
     lower: float
     upper: float
     scale: float
+    stated: bool = False
 
 
 @dataclass(frozen=True)

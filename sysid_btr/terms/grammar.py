@@ -173,10 +173,12 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
     free = [k for k, v in zip(kinds, fixed, strict=True) if v is None] if fixed else kinds
     known = []
     for parameter, kind in zip(term.parameters, free, strict=True):
-        bounds = _own_bounds(parameter.name, term.called, places[0], robot.bounds, (kind.lower, kind.upper))
+        stated = _own_bounds(parameter.name, term.called, places[0], robot.bounds)
+        bounds = stated or (kind.lower, kind.upper)
         named = f"{parameter.name.partition(':')[0]}:{label}"
         kind = term.in_units_of(kind, slide=_slides(model, places[0]))
-        known.append(parameter_of(replace(kind, lower=bounds[0], upper=bounds[1]), named))
+        own = parameter_of(replace(kind, lower=bounds[0], upper=bounds[1]), named)
+        known.append(replace(own, stated=stated is not None))
     return replace(term, known=tuple(known))
 
 
@@ -185,9 +187,9 @@ def _slides(model: mujoco.MjModel, place: str) -> bool:
 
 
 def _own_bounds(
-    name: str, field: str, place: str, table: Mapping[str, tuple[float, float]], default: tuple[float, float]
-) -> tuple[float, float]:
+    name: str, field: str, place: str, table: Mapping[str, tuple[float, float]]
+) -> tuple[float, float] | None:
     for key in (name, f"{field}:{place}", field):
         if key in table:
             return table[key]
-    return default
+    return None
