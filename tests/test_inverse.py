@@ -231,6 +231,17 @@ def test_a_replay_of_a_log_without_commands_predicts_its_torques(
     assert set(predicted.joints("effort")) == set(JOINTS)
 
 
+def test_a_fit_of_a_model_that_lacks_something_says_so_first(arm: Robot) -> None:
+    wrong = fit(study_of(arm, moved({"dof_frictionloss": (0.0, 0.25, 0.0)})), ["mass:hand"])
+    assert wrong.misfit is not None
+    assert (wrong.misfit.channel, wrong.misfit.joint) == ("effort", "elbow")
+    assert wrong.message.startswith("what is left of the effort is ")
+    assert wrong.to_dict()["misfit"]["times_noise"] == pytest.approx(wrong.before.train["effort"].chi2 ** 0.5)
+    right = fit(study_of(arm, moved()), ["mass:hand"])
+    assert right.misfit is None
+    assert right.message.startswith("1 of 1 parameters")
+
+
 def test_bounds_that_nobody_stated_grow_and_stated_ones_are_said(arm: Robot) -> None:
     heavy = mujoco.MjModel.from_xml_string(ARM)
     mass, inertia = heavy.body_mass.copy(), heavy.body_inertia.copy()

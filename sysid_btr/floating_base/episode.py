@@ -65,6 +65,7 @@ class FloatingProcedure(Procedure):
     fuses: ClassVar[bool] = True
     costly: ClassVar[bool] = True
     leaves_ground_error: ClassVar[bool] = True
+    tolerated: ClassVar[float] = 4.0
     no_torque: ClassVar[str] = "its base was floating, and segments are too short"
 
     def coarse(self, numerics: Numerics) -> Numerics:

@@ -76,6 +76,7 @@ class Procedure:
     fuses : whether `fuse` has more to say than the residuals.
     costly : whether each candidate is a simulation of its own, so that fewer are asked for.
     leaves_ground_error : whether the right model leaves an error that no effect explains: that of its ground.
+    tolerated : chi2 of fitted data up to which the model counts as right: noise floors are read from logs.
     replayed : whether its commands are replayed at all.
     no_torque : why the missing torque cannot be characterised, where it cannot.
     """
@@ -90,6 +91,7 @@ class Procedure:
     fuses: ClassVar[bool] = False
     costly: ClassVar[bool] = False
     leaves_ground_error: ClassVar[bool] = False
+    tolerated: ClassVar[float] = 1.5
     replayed: ClassVar[bool] = True
     no_torque: ClassVar[str] = "the replay fails or is too short"
 

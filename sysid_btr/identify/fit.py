@@ -21,7 +21,7 @@ from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
 from sysid_btr.identify.outcome import StudyOutcome
-from sysid_btr.identify.scores import Scores, score
+from sysid_btr.identify.scores import Misfit, Scores, misfit_of, score
 from sysid_btr.identify.step_check import Optimum, with_short_steps
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
@@ -75,7 +75,8 @@ class Fit(StudyOutcome):
     def message(self) -> str:
         """The outcome in one sentence."""
         identifiable = sum(e.identifiable != "no" for e in self.estimates)
-        parts = [f"{identifiable} of {len(self.estimates)} parameters are identifiable from this log"]
+        parts = [] if self.misfit is None else [self.misfit.words]
+        parts.append(f"{identifiable} of {len(self.estimates)} parameters are identifiable from this log")
         channel = self.study.leading_channel
         if channel in self.before.holdout:
             nominal, before = self.nominal.holdout[channel], self.before.holdout[channel]
@@ -87,6 +88,11 @@ class Fit(StudyOutcome):
         return "; ".join(parts) + "."
 
     @property
+    def misfit(self) -> Misfit | None:
+        """How far the fitted model is from its own data; None where it explains them down to their noise."""
+        return misfit_of(self.before.train, self.study.leading_channel, self.study.procedure.tolerated)
+
+    @property
     def found(self) -> dict[str, Any]:
         """What results of kind ``fit`` have beside study and cost; as no effect is added, after equals before."""
         before = self.before.to_dict()
@@ -95,6 +101,7 @@ class Fit(StudyOutcome):
             "message": self.message,
             "converged": self.result.converged,
             "termination": self.result.termination.value,
+            "misfit": None if self.misfit is None else asdict(self.misfit),
             "noise_floor": self.before.floors,
             "nominal": self.nominal.to_dict(),
             "before": before,

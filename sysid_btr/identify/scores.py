@@ -54,6 +54,39 @@ class Scores:
         return {"train": channel_entries(self.train), "holdout": channel_entries(self.holdout)}
 
 
+@dataclass(frozen=True)
+class Misfit:
+    """What a model leaves of data that it was fitted to, where that is more than noise.
+
+    Attributes
+    ----------
+    channel, joint : where, and at which joint most.
+    times_noise : root-mean-square error over the noise floor.
+    """
+
+    channel: str
+    joint: str
+    times_noise: float
+
+    @property
+    def words(self) -> str:
+        """In a sentence."""
+        return (
+            f"what is left of the {self.channel} is {self.times_noise:.2g} times its noise, most at {self.joint}: the "
+            "model lacks something, and intervals hold for the model as it is (`sysid-btr close` looks for what is "
+            "missing)"
+        )
+
+
+def misfit_of(part: Mapping[str, ChannelScore], channel: str, tolerated: float) -> Misfit | None:
+    """The misfit in one channel of fitted data; None up to a tolerated chi2."""
+    one = part.get(channel)
+    if one is None or not one.chi2 > tolerated:
+        return None
+    worst = max(one.joints, key=lambda joint: one.joints[joint])
+    return Misfit(channel, worst, float(np.sqrt(one.chi2)))
+
+
 def channel_entries(part: Mapping[str, ChannelScore]) -> dict[str, dict[str, Any]]:
     """Scores by channel: rmse, nrmse, chi2, and the rmse of each joint."""
     return {
