@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.cli.groups import FittingOptions, OutOptions, SearchingOptions
-from sysid_btr.cli.inputs import check_channels, initial_values, read_holdout, read_logs, warn_of, with_noise
+from sysid_btr.cli.inputs import as_stated, check_channels, initial_values, read_holdout, read_logs, warn_of
 from sysid_btr.cli.options import deciding
 from sysid_btr.cli.terminal import print_result, remark
 from sysid_btr.errors import InterruptedRun, LostCluster, UsageError
@@ -85,7 +85,7 @@ class Run:
     def open(cls, verb: str, options: FittingOptions, robot: Robot) -> Run:
         """Read logs and open the journal; nothing is simulated yet."""
         check_channels(options.channels)
-        logs = with_noise(read_logs(options.log), options.noise)
+        logs = as_stated(read_logs(options.log), options)
         run = cls(verb, options, robot, logs, Keeper.open(verb, options, robot))
         if options.render and run.keeper.folder is None:
             raise UsageError("--render writes pictures: give an --out folder for them")
@@ -101,7 +101,7 @@ class Run:
         return make_study(
             self.robot,
             self.logs,
-            holdout=read_holdout(self.options.holdout, self.options.noise),
+            holdout=read_holdout(self.options.holdout, self.options),
             channels=self.options.channels or FITTED,
             simulator=self.options.simulator,
             mode=Mode(self.options.mode),

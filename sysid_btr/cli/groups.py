@@ -41,6 +41,26 @@ class LogOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReadingOptions(LogOptions):
+    """Recordings, and what is known of them beyond what they hold."""
+
+    noise: Numbers = option(
+        {},
+        "Standard deviation of a channel's or column's noise (SI), e.g. position=1e-4.",
+        otherwise="as the logs state it, or read from them",
+        metavar="NAME=SIGMA",
+        decides=True,
+    )
+    shift: Numbers = option(
+        {},
+        "Seconds by which a channel's or column's values come later, e.g. command=1.41: streams that were started "
+        "apart.",
+        metavar="NAME=SECONDS",
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ParameterOptions(Options):
     """Which parameters of the model are free, and where."""
 
@@ -84,7 +104,7 @@ class ModeOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyOptions(ModelOptions, LogOptions, ParameterOptions, ParamsOptions, ModeOptions):
+class StudyOptions(ModelOptions, ReadingOptions, ParameterOptions, ParamsOptions, ModeOptions):
     """What is fitted to what: shared by `fit`, `posterior` and `close`."""
 
     holdout: Holdout = option(
@@ -92,13 +112,6 @@ class StudyOptions(ModelOptions, LogOptions, ParameterOptions, ParamsOptions, Mo
         "Logs that are not fitted but predicted, or the last fraction of each log.",
         metavar="FILE|FRACTION",
         beside=True,
-        decides=True,
-    )
-    noise: Numbers = option(
-        {},
-        "Standard deviation of a channel's or column's noise (SI), e.g. position=1e-4.",
-        otherwise="as the logs state it, or read from them",
-        metavar="NAME=SIGMA",
         decides=True,
     )
     channels: Names = option(

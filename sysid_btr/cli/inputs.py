@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sysid_btr.cli.groups import ModelOptions
-from sysid_btr.cli.kinds import Holdout, Numbers, Ranges, number
+from sysid_btr.cli.groups import ModelOptions, ReadingOptions
+from sysid_btr.cli.kinds import Holdout, Ranges, number
 from sysid_btr.cli.terminal import remark
 from sysid_btr.errors import LogError, ModelError, UsageError
 
@@ -107,25 +107,39 @@ def read_logs(paths: Iterable[Path], *, motions: bool = False) -> list[Log]:
     return logs
 
 
-def read_holdout(given: Holdout, noise: Numbers) -> float | list[Log]:
+def read_holdout(given: Holdout, options: ReadingOptions) -> float | list[Log]:
     """The fraction, or the logs, that are not fitted."""
-    return with_noise(read_logs(given), noise) if isinstance(given, tuple) else given
+    return as_stated(read_logs(given), options) if isinstance(given, tuple) else given
 
 
-def with_noise(logs: list[Log], noise: Numbers) -> list[Log]:
-    """The logs with the noise that the user states, over what they state themselves."""
+def as_stated(logs: list[Log], options: ReadingOptions) -> list[Log]:
+    """The logs with the noise and on the clocks that the user states, over what they state themselves.
+
+    Raises
+    ------
+    UsageError
+        For a channel or column that no log has, and a noise of nothing.
+    """
     from dataclasses import replace
 
-    from sysid_btr.io.log import with_hint
+    from sysid_btr.io.shift import shift_streams
 
-    wrong = [f"{name}={value:g}" for name, value in noise.items() if not value > 0]
+    wrong = [f"{name}={value:g}" for name, value in options.noise.items() if not value > 0]
     if wrong:
         raise UsageError(f"--noise {', '.join(wrong)}: a standard deviation is above zero")
+    _check_streams("--noise", options.noise, logs)
+    _check_streams("--shift", options.shift, logs)
+    shifted = (shift_streams(log, options.shift) for log in logs)
+    return [replace(log, meta=replace(log.meta, noise={**log.meta.noise, **options.noise})) for log in shifted]
+
+
+def _check_streams(flag: str, given: Iterable[str], logs: Sequence[Log]) -> None:
+    from sysid_btr.io.log import with_hint
+
     known = {part for log in logs for column in log.channels for part in (column, column.partition(".")[0])}
-    unknown = [name for name in noise if name not in known]
+    unknown = [name for name in given if name not in known]
     if unknown:
-        raise UsageError(f"--noise: no log has {', '.join(with_hint(name, known) for name in unknown)}")
-    return [replace(log, meta=replace(log.meta, noise={**log.meta.noise, **noise})) for log in logs]
+        raise UsageError(f"{flag}: no log has {', '.join(with_hint(name, known) for name in unknown)}")
 
 
 def warn_of(robot: Robot, logs: Iterable[Log]) -> None:

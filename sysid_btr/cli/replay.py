@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 from sysid_btr.cli.groups import (
     JsonOptions,
-    LogOptions,
     ModelOptions,
     ModeOptions,
     ParamsOptions,
+    ReadingOptions,
     SimulatorOptions,
     ThreadOptions,
 )
-from sysid_btr.cli.inputs import find_robot, read_logs, warn_of
+from sysid_btr.cli.inputs import as_stated, find_robot, read_logs, warn_of
 from sysid_btr.cli.kinds import Numbers
 from sysid_btr.cli.options import option
 from sysid_btr.cli.terminal import print_json, remark
@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayOptions(ModelOptions, LogOptions, ParamsOptions, ModeOptions, SimulatorOptions, ThreadOptions, JsonOptions):
+class ReplayOptions(
+    ModelOptions, ReadingOptions, ParamsOptions, ModeOptions, SimulatorOptions, ThreadOptions, JsonOptions
+):
     """Options of `replay`."""
 
     set: Numbers = option({}, "Change the model first, e.g. 'kp:*=0.9'.", metavar="PARAMETERS=VALUE", decides=False)
@@ -48,7 +50,7 @@ def replay(options: ReplayOptions) -> int:
     """
     began = time.perf_counter()
     robot = find_robot(options)
-    logs = read_logs(options.log, motions=True)
+    logs = as_stated(read_logs(options.log, motions=True), options)
     model, numerics = _changed(robot, options)
     targets = _targets(options.out, logs, options.overwrite)
     warn_of(robot, [one for one in logs if not one.is_motion])

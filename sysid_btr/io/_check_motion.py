@@ -128,8 +128,8 @@ def _late(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
             "warning",
             some(f"{joint} ({lag:+.2f} s)" for joint, lag in chosen.items()),
             f"{text}: command and position seem to come from different clocks",
-            "align the two streams before they are merged; if the robot moves to each target over a set time, "
-            "log the interpolated command instead",
+            f"if they were started apart: --shift command={worst:.2f}; if the robot moves to each target over a set "
+            "time, log the interpolated command instead",
         )
 
 

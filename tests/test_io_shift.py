@@ -1,0 +1,59 @@
+"""Streams that were started apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sysid_btr.cli.commands import run
+from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.shift import shift_streams
+from sysid_btr.io.validation import validate_log
+
+
+def swinging(late: float, hold: str = "linear") -> Log:
+    time = np.arange(1000) / 100
+    command = sum(np.sin(2 * np.pi * f * time + 9 * f) for f in (0.23, 0.53, 0.81, 1.13)) / 3
+    position = np.interp(time - late - 0.04, time, command)
+    meta = LogMeta(sample_period=0.01, command_hold=hold)  # type: ignore[arg-type]
+    return Log(time, {"command.knee": command, "position.knee": position}, meta, np.zeros(1000, dtype=np.int64))
+
+
+def test_validate_says_by_how_much_and_the_shift_mends_it() -> None:
+    log = swinging(1.41)
+    (late,) = [p for p in validate_log(log) if p.code == "joint.late"]
+    assert "--shift command=1.4" in late.remedy
+    mended = shift_streams(log, {"command": 1.41})
+    assert not [p for p in validate_log(mended) if p.code == "joint.late"]
+    inside = log.time > 1.5
+    np.testing.assert_allclose(
+        mended.channels["command.knee"][inside],
+        np.interp(log.time - 1.41, log.time, log.channels["command.knee"])[inside],
+    )
+    assert mended.channels["position.knee"] is log.channels["position.knee"]
+
+
+def test_held_commands_stay_steps_and_sensors_end_where_nothing_is_known() -> None:
+    log = swinging(0.0, hold="zoh")
+    moved = shift_streams(log, {"command": 0.25, "position.knee": -0.1})
+    np.testing.assert_array_equal(moved.channels["command.knee"][25:], log.channels["command.knee"][:-25])
+    assert (moved.channels["command.knee"][:25] == log.channels["command.knee"][0]).all()
+    np.testing.assert_allclose(moved.channels["position.knee"][:-10], log.channels["position.knee"][10:])
+    assert np.isnan(moved.channels["position.knee"][-9:]).all()
+
+
+def test_episodes_do_not_flow_into_each_other() -> None:
+    log = swinging(0.0)
+    two = replace(log, episode=np.repeat([0, 1], 500))
+    moved = shift_streams(two, {"command": 0.2}).channels["command.knee"]
+    assert moved[500:520] == pytest.approx(log.channels["command.knee"][500])
+
+
+def test_a_stream_that_no_log_has_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    leg = Path(__file__).parent.parent / "sample_logs"
+    asked = ["fit", "-m", str(leg / "leg.xml"), "-l", str(leg / "leg_clean.parquet"), "-f", "mass:*"]
+    assert run([*asked, "--shift", "comand=1"]) == 2
+    assert "did you mean command?" in capsys.readouterr().err
