@@ -14,6 +14,7 @@ import numpy as np
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.episode import Episode
 from sysid_btr.io.log import Log
+from sysid_btr.models.commands import FED_FORWARD
 from sysid_btr.models.robot import Robot, joint_names
 
 AUTO = "auto"
@@ -92,13 +93,17 @@ def _resolve(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
     if mode.name != AUTO:
         return mode.name, "as asked for"
     joints = joint_names(robot)
-    if not any(_commanded(log, j) for j in joints) and any(log.has("effort", j) for j in joints):
+    if not _commanded(log) and any(log.has("effort", j) for j in joints):
         return "inverse", "no command is logged"
     return "forward", ""
 
 
-def _commanded(log: Log, joint: str) -> bool:
-    return log.has("command", joint) and bool(np.isfinite(log.channels[f"command.{joint}"]).any())
+def _commanded(log: Log) -> bool:
+    """Whether anything was commanded, at a joint or an actuator."""
+    return any(
+        name.partition(".")[0] in ("command", *FED_FORWARD) and bool(np.isfinite(values).any())
+        for name, values in log.channels.items()
+    )
 
 
 def _kind(mode: str) -> Any:
