@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -15,6 +16,7 @@ from sysid_btr.errors import ModelError
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
+from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.problem import Problem
 from sysid_btr.io.validation import validate_log
 from sysid_btr.models.log_checks import check_log
@@ -340,3 +342,94 @@ def test_a_coupled_joint_starts_and_moves_with_the_one_it_follows() -> None:
     moved = replay.predict(np.zeros((1, 0))).position[0]
     # MuJoCo's couplings are soft
     assert np.abs(moved[:, 1] - 0.1 - 2 * moved[:, 0]).max() < 0.02
+
+
+# --- filters, switches, currents --------------------------------------------------------------------------
+
+LAG = 0.05
+FILTERED = (
+    '<general name="{j}" joint="{j}" dyntype="%s" dynprm="0.05" gainprm="30" biastype="affine" biasprm="0 -30 -1"/>'
+)
+
+
+def finely(robot: Robot, ctrl: FloatArray) -> FloatArray:
+    """(n, joints) of MuJoCo with the model's own filters, at steps of 20 us; these begin at the first ctrl."""
+    model = robot.compile()
+    model.opt.timestep = 2e-5
+    data = mujoco.MjData(model)
+    data.act[:] = ctrl[0]
+    found = [data.qpos.copy()]
+    for row in ctrl[:-1]:
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, 200)
+        found.append(data.qpos.copy())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("kind", ["filter", "filterexact"])
+def test_a_filter_of_the_model_is_the_same_by_steps_of_either_kind_and_in_the_limit_mujocos(kind: str) -> None:
+    robot = arm(FILTERED % kind)
+    log = commands(command__shoulder=WAVE, command__elbow=-2 * WAVE)
+    fine = Numerics("RK4", STEP)
+    whole = Replay(robot, log, (), fine).predict(np.zeros((1, 0))).position[0]
+    law = StribeckFriction(("elbow",))
+    stepwise = Replay(robot, log, (law,), fine).predict(law.neutral[None]).position[0]
+    np.testing.assert_allclose(stepwise, whole, rtol=0, atol=1e-6)
+    assert np.abs(whole - finely(robot, np.column_stack([WAVE, -2 * WAVE]))).max() < 2e-4
+    assert np.abs(whole - only(log, arm(ACTUATORS["position"]))).max() > 0.02
+
+
+def test_a_filter_can_be_added_and_the_models_own_be_changed() -> None:
+    log = commands(command__shoulder=WAVE, command__elbow=-2 * WAVE)
+    own = replayed(arm(FILTERED % "filterexact"), log).position
+    plain = arm(FILTERED % "none")
+    added = parse_parameters(["actuator_filter:*=shared"], plain)
+    np.testing.assert_allclose(replayed(plain, log, added, [LAG]).position, own, rtol=0, atol=1e-12)
+    other = arm((FILTERED % "filterexact").replace("0.05", "0.2"))
+    instead = parse_parameters(["filter_time:*=shared"], other)
+    assert instead[0].parameters[0].nominal == 0.2
+    np.testing.assert_allclose(replayed(other, log, instead, [LAG]).position, own, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(replayed(other, log, instead, [0.0]).position, only(log, plain)[None], atol=1e-12)
+
+
+def test_a_filter_of_a_gripper_begins_at_rest() -> None:
+    filtered = GRIPPER.replace("gainprm", 'dyntype="filterexact" dynprm="0.1" gainprm')
+    log = commands(command__grip=np.full(len(TIME), 120.0))
+    np.testing.assert_allclose(
+        only(log, robot_from_xml(ARM.format(more=filtered))), only(log, robot_from_xml(ARM.format(more=GRIPPER)))
+    )
+
+
+def test_a_servo_is_off_where_the_log_says_so() -> None:
+    on = np.where(TIME < 0.8, 1.0, 0.0)
+    robot, moved = arm(ACTUATORS["position"]), {"command.shoulder": WAVE, "command.elbow": -2 * WAVE}
+    log = make_log(TIME, {**moved, "enabled.elbow": on})
+    found = replayed(robot, log, effort=True)
+    model = Replay(robot, commands(), (), NUMERICS).model
+    data, rows = mujoco.MjData(model), []
+    elbow = model.actuator("elbow").id
+    for k in range(len(TIME)):
+        rows.append(data.qpos.copy())
+        model.actuator_gainprm[elbow, 0], model.actuator_biasprm[elbow, 1:3] = 30 * on[k], [-30 * on[k], -on[k]]
+        data.ctrl[:] = [WAVE[k], -2 * WAVE[k]]
+        mujoco.mj_step(model, data, 2)
+    np.testing.assert_allclose(found.position[0], np.array(rows), rtol=0, atol=1e-9)
+    assert found.effort is not None
+    assert np.abs(found.effort[0, TIME > 0.81, 1]).max() < 1e-12
+
+
+def test_a_free_swing_without_a_command_is_a_whole_log() -> None:
+    still = {f"{c}.{j}": 0 * TIME for c in ("enabled",) for j in ("shoulder", "elbow")}
+    log = moving(make_log(TIME, still))
+    assert [p for p in check_log(arm(ACTUATORS["position"]), log) if p.severity == "error"] == []
+
+
+def test_a_current_times_a_torque_constant_is_a_torque(tmp_path: Path) -> None:
+    log = moving(commands(current__shoulder=WAVE, current__elbow=-2 * WAVE))
+    log = replace(log, meta=replace(log.meta, torque_constant={"shoulder": 0.1, "elbow": 0.2}))
+    write_log(log, tmp_path / "log.parquet")
+    read = read_log(tmp_path / "log.parquet")
+    np.testing.assert_allclose(read.channels["effort.shoulder"], 0.1 * WAVE)
+    np.testing.assert_allclose(read.channels["effort.elbow"], -0.4 * WAVE)
+    (note,) = [p for p in validate_log(read) if p.code == "current.torque"]
+    assert note.severity == "note"

@@ -134,6 +134,15 @@ def _pairs(
             "no command is logged: the measured torques are compared with those that the measured motion takes",
             "nothing, if none was recorded; what limits, delays or gains of servos do cannot be found without it",
         )
+    currents = [] if log.meta.torque_constant is None else [j for j in log.joints("current") if log.has("effort", j)]
+    if currents:
+        yield Problem(
+            "current.torque",
+            "note",
+            some([f"current.{joint}" for joint in currents]),
+            "the metadata state a torque constant: where no effort was logged, current times that constant is one",
+            "nothing, if that is right",
+        )
     if not commands or not positions:
         return
     only_command = [name for name in commands if name not in positions and name not in controls]

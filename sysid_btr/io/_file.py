@@ -309,7 +309,20 @@ def _log(table: pa.Table, meta: LogMeta, path: Path, problems: list[Problem]) ->
         )
     if time is None or n == 0:
         return None
+    channels |= torques_of_currents(channels, meta)
     return Log(time=time, channels=channels, meta=meta, episode=episode, path=path, unknown=unknown)
+
+
+def torques_of_currents(channels: Mapping[str, FloatArray], meta: LogMeta) -> dict[str, FloatArray]:
+    """`effort` of joints that have a current and, in the metadata, a torque constant, but no effort of their own."""
+    constant = meta.torque_constant
+    found = {}
+    for name, values in channels.items():
+        channel, _, joint = name.partition(".")
+        known = constant.get(joint) if isinstance(constant, Mapping) else constant
+        if channel == "current" and known is not None and f"effort.{joint}" not in channels:
+            found[f"effort.{joint}"] = known * values
+    return found
 
 
 def _time(columns: Mapping[str, pa.ChunkedArray], meta: LogMeta, n: int, problems: list[Problem]) -> FloatArray | None:

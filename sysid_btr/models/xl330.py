@@ -60,6 +60,7 @@ class Supply(Term):
     nominal: float = 7.4
 
     name: ClassVar[str] = "supply"
+    switches: ClassVar[bool] = True
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         for joint, column in zip(self.places, index, strict=True):

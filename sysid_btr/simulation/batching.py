@@ -102,6 +102,7 @@ def _joinable(a: Replay, b: Replay) -> bool:
     same = (
         a.terms == b.terms
         and a.robot.always == b.robot.always
+        and a.switched == b.switched
         and a.numerics == b.numerics
         and a.effort == b.effort
         and a.threads == b.threads

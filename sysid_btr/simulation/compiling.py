@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -49,12 +50,30 @@ def compile_model(robot: Robot, log: Log, terms: Sequence[Term], numerics: Numer
     for joint in spec.joints:
         joint.solref_friction = [constant, 1.0]
         joint.solimp_friction = [0.99, 0.999, 0.001, 0.5, 2.0]
+    _filter_commands(spec)
     for term in terms:
         term.edit_spec(spec)
     try:
         return spec.compile()
     except ValueError as error:
         raise ModelError(f"model {robot.name}: MuJoCo cannot compile it: {error}") from error
+
+
+def _filter_commands(spec: mujoco.MjSpec) -> None:
+    """Take the filters out of drives of joints: their commands come filtered (`lagged`), however they are simulated.
+
+    The time constant stays where MuJoCo has it, zero where there is no filter.
+    """
+    import mujoco
+
+    onto = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    drives = [actuator for actuator in spec.actuators if actuator.trntype in onto]
+    several = Counter(actuator.target for actuator in drives)
+    for actuator in (a for a in drives if several[a.target] == 1):
+        if actuator.dyntype in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
+            actuator.dyntype = mujoco.mjtDyn.mjDYN_NONE
+        elif actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
+            actuator.dynprm = [0.0, *actuator.dynprm[1:]]
 
 
 def make_index(model: mujoco.MjModel) -> JointAddresses:

@@ -27,6 +27,8 @@ from sysid_btr.simulation.silence import silenced
 from sysid_btr.simulation.simulator import States
 from sysid_btr.simulation.start import coupled_state, initial_state
 from sysid_btr.terms.base import BatchModel, JointAddresses, Outputs, Parameter, Term
+from sysid_btr.terms.drives import joint_drives
+from sysid_btr.terms.power import Switch
 
 if TYPE_CHECKING:
     import mujoco
@@ -68,13 +70,22 @@ class Replay:
         It runs there on one thread: who sends it has many of them run side by side.
         """
         own = {f.name: getattr(self, f.name) for f in fields(self)}
-        made = {name: getattr(self, name) for name in ("model", "index", "start", "grid")}
+        made = {name: getattr(self, name) for name in ("model", "index", "start", "grid", "switched")}
         robot = replace(self.robot, make_spec=made_elsewhere, configure=None)
         return {**own, **made, "robot": robot, "threads": 1}
 
     @property
     def all_terms(self) -> tuple[Term, ...]:
-        return (*self.robot.always, *self.terms)
+        return (*self.robot.always, *self.terms, *self.switched)
+
+    @cached_property
+    def switched(self) -> tuple[Term, ...]:
+        """What turns drives off where the log says that they are, unless the robot's own terms do."""
+        own = {place for term in self.robot.always if term.switches for place in term.places}
+        joints = (drive.joint for drive in joint_drives(self.robot.model))
+        enabled = {j: self.log.channels[f"enabled.{j}"] for j in joints if self.log.has("enabled", j) and j not in own}
+        off = tuple(joint for joint, values in enabled.items() if np.any(values == 0))
+        return (Switch(off),) if off else ()
 
     @cached_property
     def model(self) -> mujoco.MjModel:

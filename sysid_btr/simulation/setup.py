@@ -135,10 +135,14 @@ def prepare(
         torque = term.applied_torque(batch, values, border_time)
         if torque is not None:
             applied = torque if applied is None else applied + torque
+    command = lagged(batch, command)
     laws = laws_of(batch.index, pairs)
     state = {name: np.zeros((batch.size, size)) for name, size in (("qpos", batch.model.nq), ("qvel", batch.model.nv))}
     state["qpos"][:] = batch.model.qpos0
     state["qpos"][:, batch.index.qpos], state["qvel"][:, batch.index.dof] = qpos, qvel
+    control = extra[:, lead:, :controls] if extra is not None and controls else None
+    if control is not None and batch.model.na:
+        state["act"] = _at_rest(batch, control[:, 0])
     return Setup(
         batch,
         {**state, **batch.state},
@@ -148,8 +152,20 @@ def prepare(
         inputs() if laws else {},
         numerics.held_steps,
         effort,
-        extra[:, lead:, :controls] if extra is not None and controls else None,
+        control,
     )
+
+
+def _at_rest(batch: BatchModel, control: FloatArray) -> FloatArray:
+    """Activations (m, na) of filters that have come to rest at the first ctrl (m, nc); zero of anything else."""
+    from mujoco import mjtDyn
+
+    model, filters = batch.model, (int(mjtDyn.mjDYN_FILTER), int(mjtDyn.mjDYN_FILTEREXACT))
+    activation = np.zeros((batch.size, model.na))
+    for k, a in enumerate(batch.index.control):
+        if int(model.actuator_dyntype[a]) in filters:
+            activation[:, model.actuator_actadr[a]] = control[:, k]
+    return activation
 
 
 def laws_of(index: JointAddresses, pairs: Values) -> tuple[Law, ...]:
@@ -157,6 +173,27 @@ def laws_of(index: JointAddresses, pairs: Values) -> tuple[Law, ...]:
     laws = [Law(term, values, _places(index, term)) for term, values in pairs if type(term).overrides("law")]
     # what a servo does comes before what depends on it
     return tuple(sorted(laws, key=lambda law: law.term.law_acts == ("friction",)))
+
+
+def lagged(batch: BatchModel, command: FloatArray) -> FloatArray:
+    """Commands (m, steps, j) behind the first-order filters of their drives, which begin at rest at the first one.
+
+    Exact for held commands: the mean over each step of u + (y - u) exp(-t / T), where y is the filter's output at its
+    beginning.
+    """
+    from scipy.signal import lfilter
+
+    driven = np.flatnonzero(batch.index.actuator >= 0)
+    constant = batch.read("actuator_dynprm")[:, batch.index.actuator[driven], 0]
+    if not np.any(constant > 0):
+        return command
+    shaped = np.array(np.broadcast_to(command, (batch.size, *command.shape[1:])))
+    for row, drive in np.argwhere(constant > 0):
+        ratio = batch.timestep / constant[row, drive]
+        gone, u = -np.expm1(-ratio), shaped[row, :, driven[drive]]
+        y, _ = lfilter([0.0, gone], [1.0, gone - 1], u, zi=u[:1])
+        shaped[row, :, driven[drive]] = u + (y - u) * gone / ratio
+    return shaped
 
 
 def fed_forward(batch: BatchModel, velocity: FloatArray, torque: FloatArray) -> FloatArray:

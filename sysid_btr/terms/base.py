@@ -251,6 +251,8 @@ class Term:
     """What its places are where it is declared, if not that."""
     structural: ClassVar[bool] = False
     """Whether it adds joints to the model, which then has to be compiled for its places."""
+    switches: ClassVar[bool] = False
+    """Whether its law takes the torque of a drive away where the log's `enabled` is false."""
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
     """What the law may change beside the joint torque: gain and motor torque, friction, limits."""
 

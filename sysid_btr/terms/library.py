@@ -40,7 +40,7 @@ from sysid_btr.terms.sensing import (
     TorqueOffset,
     TorqueScale,
 )
-from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain, Kp, Kv, TorqueConstant
+from sysid_btr.terms.servo import ActuatorFilter, BackEmf, CommandDelay, IntegralGain, Kp, Kv, TorqueConstant
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
@@ -64,6 +64,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     BackEmf,
     Armature,
     CommandDelay,
+    ActuatorFilter,
     SensorDelay,
     DriveCoupling,
     DriveCouplingDifference,

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Step
+from sysid_btr.terms.base import BatchModel, Kind, Step, Term
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 
@@ -61,6 +61,24 @@ class VoltageSagLoad(VoltageSag):
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         total = np.abs(step.torque).sum(axis=1, keepdims=True)
         step.gain /= 1 + values[:, 0, :1] * total
+
+
+@dataclass(frozen=True)
+class Switch(Term):
+    """A drive that gives no torque while the log says that it is off; no effect, and without parameters.
+
+    Law: no torque where `enabled` is false.
+    """
+
+    name: ClassVar[str] = "switch"
+    law_acts: ClassVar[tuple[str, ...]] = ("servo",)
+    switches: ClassVar[bool] = True
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        for joint, column in zip(self.places, index, strict=True):
+            on = step.inputs[f"enabled.{joint}"]
+            step.gain[:, column] *= on
+            step.motor_torque[:, column] *= on
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope, Step
+from sysid_btr.terms.drives import joint_drives
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 def servos(batch: BatchModel, places: tuple[str, ...]) -> IntArray:
@@ -164,6 +168,44 @@ class BackEmf(Effect):
             step.motor_torque[:, column] -= change
             step.limit_low[:, column] -= change
             step.limit_high[:, column] -= change
+
+
+@dataclass(frozen=True)
+class ActuatorFilter(Effect):
+    """A drive that follows its command through a first-order filter: T u' + u = command.
+
+    Native: the first of `actuator_dynprm`, the time constant of the model's own filter.
+    """
+
+    name: ClassVar[str] = "actuator_filter"
+    field: ClassVar[str] = "filter_time"
+    title: ClassVar[str] = "filter of the command"
+    scope: ClassVar[Scope] = "drive"
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.5, 0.005),)
+    everywhere: ClassVar[bool] = True
+    yields_to: ClassVar[tuple[str, ...]] = ("command_delay",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("command_delay", "motion at several frequencies: a filter also weakens the fast ones"),
+        ("viscous_damping", "motion at several frequencies"),
+    )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return (((0.01,),), ((0.04,),))
+
+    @classmethod
+    def own_value(cls, model: mujoco.MjModel, place: str) -> float:
+        import mujoco
+
+        filters = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
+        actuator = next(drive.actuator for drive in joint_drives(model) if drive.joint == place)
+        filtered = int(model.actuator_dyntype[actuator]) in filters
+        return float(model.actuator_dynprm[actuator, 0]) if filtered else 0.0
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        ids, constant = servos(batch, self.places), batch.read("actuator_dynprm")
+        constant[:, ids, 0] = np.maximum(self.changed(constant[:, ids, 0], values[:, :, 0]), 0.0)
+        return {"actuator_dynprm": constant}
 
 
 @dataclass(frozen=True)

@@ -361,13 +361,13 @@ def _general(now: Compiled, target: mujoco.MjModel, i: int, element: Element) ->
     }
     if element.tag == "general":
         return values
-    kind = int(target.actuator_dyntype[i])
+    kind = int(now.model.actuator_dyntype[i])
     if target.actuator_gaintype[i] != 0 or target.actuator_biastype[i] not in (0, 1) or kind >= len(DYNAMICS):
         raise CannotWriteError(f"<{element.tag}> actuator {target.actuator(i).name!r} cannot be given other gains")
     values |= {"gaintype": "fixed", "biastype": ("none", "affine")[int(target.actuator_biastype[i])]}
     values |= {"dyntype": DYNAMICS[kind]}
     if kind:
-        values["dynprm"] = numbers(target.actuator_dynprm[i][: significant(target.actuator_dynprm[i])])
+        values["dynprm"] = numbers(now.model.actuator_dynprm[i][: significant(now.model.actuator_dynprm[i])])
     if target.actuator_ctrllimited[i]:
         values |= {"ctrllimited": "true", "ctrlrange": numbers(target.actuator_ctrlrange[i])}
     if target.actuator_actlimited[i]:
