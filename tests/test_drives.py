@@ -415,7 +415,7 @@ def test_a_servo_is_off_where_the_log_says_so() -> None:
         mujoco.mj_step(model, data, 2)
     np.testing.assert_allclose(found.position[0], np.array(rows), rtol=0, atol=1e-9)
     assert found.effort is not None
-    assert np.abs(found.effort[0, TIME > 0.81, 1]).max() < 1e-12
+    assert np.abs(found.effort[0, TIME > 0.81, 1]).max() < 1e-9
 
 
 def test_a_free_swing_without_a_command_is_a_whole_log() -> None:
