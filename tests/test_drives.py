@@ -13,6 +13,8 @@ from toys import make_log, robot_from_xml
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import ModelError
+from sysid_btr.identify.fit import fit
+from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
@@ -433,3 +435,46 @@ def test_a_current_times_a_torque_constant_is_a_torque(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.channels["effort.elbow"], -0.4 * WAVE)
     (note,) = [p for p in validate_log(read) if p.code == "current.torque"]
     assert note.severity == "note"
+
+
+# --- fits ------------------------------------------------------------------------------------------------
+
+
+def recorded(robot: Robot, log: Log, parameters: dict[str, float], seed: int = 0) -> Log:
+    """What a robot with other parameters shows of commands, with the noise of an encoder."""
+    seen = replay_log(robot, log, parameters, numerics=NUMERICS)
+    rng = np.random.default_rng(seed)
+    noisy = {n: v + rng.normal(0, 2e-4, len(v)) for n, v in seen.channels.items() if n.startswith("position.")}
+    return replace(log, channels={**log.channels, **noisy})
+
+
+@pytest.mark.parametrize("drive", ["geared torque", "geared position", "geared velocity"])
+def test_a_mass_is_recovered_through_any_drive(drive: str) -> None:
+    robot = arm(ACTUATORS[drive])
+    size = 3.0 if "velocity" in drive else 1.0
+    log = commands(command__shoulder=size * WAVE, command__elbow=-size * WAVE)
+    found = fit(make_study(robot, [recorded(robot, log, {"mass:lower": 1.2})], numerics=NUMERICS), ["mass:lower"])
+    (mass,) = found.estimates
+    assert mass.std < 0.03
+    assert mass.value == pytest.approx(1.2, abs=3 * mass.std)
+
+
+def test_the_torque_that_drives_is_not_compared_with_itself() -> None:
+    robot = arm(ACTUATORS["torque"])
+    log = recorded(robot, commands(effort__shoulder=WAVE, effort__elbow=-2 * WAVE), {})
+    study = make_study(robot, [log], numerics=NUMERICS, mode=Mode("forward"))
+    (comparison,) = study.train_problem(()).episodes
+    assert [t.channel for t in comparison.targets] == ["position"]
+
+
+def test_of_two_channels_that_differ_like_degrees_the_range_of_the_joint_says_which_is_wrong() -> None:
+    robot = arm(ACTUATORS["position"])
+    log = moving(commands())
+    small = {f"command.{j}": np.radians(log.channels[f"position.{j}"]) for j in ("shoulder", "elbow")}
+    log = replace(log, channels={**log.channels, **small})
+    ranges = dict.fromkeys(("shoulder", "elbow"), (-1.5, 1.5))
+    told = {p.code: p for p in validate_log(log, joints=tuple(ranges), ranges=ranges)}
+    assert told["units.degrees_twice"].where == "command of shoulder, elbow"
+    assert "180/pi" in told["units.degrees_twice"].remedy
+    assert "units.degrees" not in told
+    assert {p.code for p in check_log(robot, log) if p.severity == "error"} == {"units.degrees"}

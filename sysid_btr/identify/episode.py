@@ -21,6 +21,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split
+from sysid_btr.models.commands import driven_by_effort
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
@@ -204,11 +205,20 @@ class Episode(ABC):
         log, present = self.log, self.logged(channels)
         replay = self.replay(terms, numerics, effort="effort" in present, threads=threads)
         targets = make_targets(log, replay.index.joints, present, self.warm_up)
+        predicted = self.predicts_torque(replay)
+        if not predicted.all():
+            targets = tuple(t.only(predicted[t.columns]) if t.channel == "effort" else t for t in targets)
+            targets = tuple(t for t in targets if t.joints)
         if not targets:
             raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
         inside = self.compared[:, None]
         inflated = (_with_noise(target, log.meta.mount, inflation or {}) for target in targets)
         return Comparison(replay, tuple(replace(t, mask=t.mask & inside) for t in inflated))
+
+    def predicts_torque(self, replay: Replay) -> BoolArray:
+        """(j,) joints of a replay whose torque is predicted: those with a drive that is not given its torque."""
+        index, given = replay.index, driven_by_effort(self.log, replay.robot.model)
+        return np.asarray((index.actuator >= 0) & [joint not in given for joint in index.joints])
 
     def scoring(self, scored: BoolArray) -> Self:
         """The same with other samples that count."""

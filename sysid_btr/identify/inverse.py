@@ -20,6 +20,7 @@ from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.inverse import InverseReplay
 from sysid_btr.simulation.kinematics import Kinematics, low_pass, smooth, uniform
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.model import Terms
 
@@ -114,6 +115,9 @@ class InverseEpisode(Episode):
 
     def logged(self, channels: Sequence[str]) -> tuple[str, ...]:
         return tuple(c for c in channels if c == "effort")
+
+    def predicts_torque(self, replay: Replay) -> BoolArray:
+        return np.ones(len(replay.index.joints), dtype=bool)
 
     def replay(
         self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0

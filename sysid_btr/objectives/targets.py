@@ -64,6 +64,18 @@ class Target:
         difference[:, ~self.mask] = 0.0
         return difference
 
+    def only(self, keep: BoolArray) -> Target:
+        """The same target of some of its columns, (k,)."""
+        return replace(
+            self,
+            joints=tuple(j for j, kept in zip(self.joints, keep, strict=True) if kept),
+            columns=self.columns[keep],
+            measured=self.measured[:, keep],
+            floor=tuple(f for f, kept in zip(self.floor, keep, strict=True) if kept),
+            sigma=self.sigma[keep],
+            mask=self.mask[:, keep],
+        )
+
     def window(self, start: float, stop: float, time: FloatArray) -> Target:
         """The same target, scored only in start <= time < stop (s since the first sample)."""
         inside = (time >= start) & (time < stop)
