@@ -9,14 +9,18 @@ five times for torques (Gautier, Dynamic identification of robots with power mod
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import TypeVar, cast
 
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.errors import LogError
 from sysid_btr.io.log import Log
+
+T = TypeVar("T")
 
 ENERGY = 0.99
 """Fraction of the velocities' energy that lies in the band of the motion."""
@@ -32,6 +36,8 @@ SLIDING = 0.02
 """Fraction of a joint's rms velocity below which it may creep: dry friction takes any value up to its size there
 (pre-sliding: Armstrong-Helouvry, Dupont, Canudas de Wit 1994, doi:10.1016/0005-1098(94)90209-7), so that slow samples
 are left out of identifications. A hundredth more or less changes no estimate beyond its error."""
+REMEMBERED = 32
+"""Results that are kept with a motion: a fraction of a megabyte each."""
 FEWEST = 64
 """Samples from which a band can be read."""
 
@@ -99,7 +105,24 @@ class Kinematics:
     def rows(self, start: int, stop: int) -> Kinematics:
         """Some samples of the grid."""
         names = ("time", "position", "velocity", "acceleration")
-        return replace(self, **{name: getattr(self, name)[start:stop] for name in names})
+        parts = {name: getattr(self, name)[start:stop] for name in names}
+        return self.remember(("rows", start, stop), lambda: replace(self, **parts))
+
+    def remember(self, key: Hashable, work: Callable[[], T]) -> T:
+        """What `work` finds of this motion: found anew only if the last so many keys did not ask for it."""
+        found = self._found.pop(key) if key in self._found else work()
+        self._found[key] = found
+        while len(self._found) > REMEMBERED:
+            self._found.pop(next(iter(self._found)))
+        return cast("T", found)
+
+    @cached_property
+    def _found(self) -> dict[Hashable, object]:
+        return {}
+
+    def __getstate__(self) -> dict[str, object]:
+        """The motion itself, without what was found of it."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def seen(self, frequency: FloatArray) -> FloatArray:
         """Fraction (f,) of a torque at each frequency (Hz) that is compared."""
