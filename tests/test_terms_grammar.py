@@ -181,3 +181,18 @@ def test_a_robots_own_bounds_win(key: str) -> None:
     scales: dict[str, JointScale] = {"arm": SCALE}
     (term,) = parse_parameters(["damping:arm"], robot, scales)
     assert (term.parameters[0].lower, term.parameters[0].upper) == (0.01, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "said"),
+    [
+        ({"mass": (-5.0, 5.0)}, "bounds -5 .. 5 of mass:knee: it cannot be negative"),
+        ({"kp:knee": (-1.0, 2.0)}, "bounds -1 .. 2 of kp:knee: it cannot be negative"),
+        ({"kp": (1e-300, 1e300)}, "cannot be searched"),
+    ],
+)
+def test_bounds_that_nothing_can_have_are_refused(bounds: dict[str, tuple[float, float]], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        parse_parameters(["mass:knee", "kp:knee"], replace(LEG, bounds=bounds))
+    (signed,) = parse_parameters(["com.x:knee"], replace(LEG, bounds={"com.x": (-0.1, 0.1)}))
+    assert signed.parameters[0].lower == -0.1

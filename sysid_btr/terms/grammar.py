@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from sysid_btr.errors import UsageError
 from sysid_btr.mujoco_conventions import SLIDE
-from sysid_btr.terms.base import Scope, Term, parameter_of
+from sysid_btr.terms.base import Kind, Scope, Term, parameter_of
 from sysid_btr.terms.library import declarable
 from sysid_btr.terms.scales import Scales, largest_scale
 
@@ -174,7 +174,7 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
     known = []
     for parameter, kind in zip(term.parameters, free, strict=True):
         stated = _own_bounds(parameter.name, term.called, places[0], robot.bounds)
-        bounds = stated or (kind.lower, kind.upper)
+        bounds = _possible(parameter.name, kind, stated) if stated else (kind.lower, kind.upper)
         named = f"{parameter.name.partition(':')[0]}:{label}"
         kind = term.in_units_of(kind, slide=_slides(model, places[0]))
         own = parameter_of(replace(kind, lower=bounds[0], upper=bounds[1]), named)
@@ -184,6 +184,23 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
 
 def _slides(model: mujoco.MjModel, place: str) -> bool:
     return any(model.joint(i).name == place and model.jnt_type[i] == SLIDE for i in range(model.njnt))
+
+
+WIDEST = 1e6
+"""Ratio of an upper to a lower bound, both positive, beyond which steps between them mean nothing."""
+
+
+def _possible(name: str, kind: Kind, stated: tuple[float, float]) -> tuple[float, float]:
+    """Stated bounds, if a parameter of this kind can have all that lies between them."""
+    lower, upper = stated
+    if kind.lower >= 0 > lower:
+        raise UsageError(f"bounds {lower:g} .. {upper:g} of {name}: it cannot be negative; give 0 or more")
+    if lower > 0 and upper > WIDEST * lower:
+        raise UsageError(
+            f"bounds {lower:g} .. {upper:g} of {name}: a range of more than {WIDEST:g} to one cannot be searched; give "
+            "a narrower one"
+        )
+    return stated
 
 
 def _own_bounds(
