@@ -148,8 +148,8 @@ class Experiment:
     joints: tuple[str, ...]
     centre: tuple[float, ...]
     size: tuple[float, ...]
-    seconds: float = 15.0
-    rate: float = 200.0
+    seconds: float = 10.0
+    rate: float = 100.0
     seed: int = 0
     logged: tuple[str, ...] | None = None
     effort: tuple[str, ...] = ()

@@ -85,12 +85,13 @@ def regress(fitted: InverseEpisode, held: InverseEpisode, sums: Sequence[tuple[s
 
 def _counted(episode: InverseEpisode) -> BoolArray:
     """(n, j) samples of the whole recording that the episode compares."""
-    return np.asarray(episode.compared[:, None] & episode.kinematics.moving)
+    counted: BoolArray = np.zeros(episode.kinematics.moving.shape, dtype=bool)
+    own = episode.compared
+    counted[: len(own)] = own[:, None] & episode.kinematics.moving[: len(own)]
+    return counted
 
 
-def _solve(
-    columns: FloatArray, measured: FloatArray, mask: BoolArray, weight: FloatArray
-) -> tuple[FloatArray, int]:
+def _solve(columns: FloatArray, measured: FloatArray, mask: BoolArray, weight: FloatArray) -> tuple[FloatArray, int]:
     """Values (p,) of least norm, and how many of them the data determine."""
     weighted = (columns * weight)[:, mask].T
     size = np.linalg.norm(weighted, axis=0)
@@ -109,8 +110,10 @@ def _rigid(
 
     bare = copy.copy(model)
     bare.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
-    for name in ("dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness", "body_mass", "body_inertia"):
+    for name in ("dof_damping", "dof_frictionloss", "jnt_stiffness", "body_mass", "body_inertia"):
         getattr(bare, name)[:] = 0.0
+    # taken off again: MuJoCo factors the inertia, which must not be singular
+    bare.dof_armature[:] = 1.0
     bare.body_ipos[:], bare.body_iquat[:] = 0.0, (1.0, 0.0, 0.0, 0.0)
     data = mujoco.MjData(bare)
     axes = np.eye(3)
@@ -125,7 +128,7 @@ def _rigid(
         for mass, centre, inertia, turn in bodies:
             bare.body_mass[body], bare.body_ipos[body], bare.body_inertia[body] = mass, centre, inertia
             bare.body_iquat[body] = (1.0, 0.0, 0.0, 0.0) if turn is None else turn
-            yield _torques(bare, data, position, velocity, acceleration, dof)
+            yield _torques(bare, data, position, velocity, acceleration, dof) - acceleration
         bare.body_mass[body], bare.body_ipos[body], bare.body_inertia[body] = 0.0, 0.0, 0.0
 
 

@@ -22,7 +22,13 @@ def examine(case: Case, work: Path, limit: float) -> dict[str, Any]:
     write_log(case.log(), log)
     (folder / "truth.json").write_text(json.dumps(case.truth, indent=1) + "\n")
     done = run(("close", "--model", str(model), "--log", str(log), *case.arguments), folder / "out", limit)
-    return {"kind": "simulated", "name": case.name, "title": case.title, "planted": planted(case), **verdict(case, done)}
+    return {
+        "kind": "simulated",
+        "name": case.name,
+        "title": case.title,
+        "planted": planted(case),
+        **verdict(case, done),
+    }
 
 
 def planted(case: Case) -> str:

@@ -10,15 +10,7 @@ import numpy as np
 
 from benchmarks.robots import machines as m
 from benchmarks.robots.planted import DryFriction, Lag, Late, Load, Planted, Rotor, SensorOffset, Viscous
-from benchmarks.robots.record import (
-    Experiment,
-    Impedance,
-    OwnControl,
-    Positions,
-    Torques,
-    Velocities,
-    record,
-)
+from benchmarks.robots.record import Experiment, Impedance, OwnControl, Positions, Torques, Velocities, record
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
@@ -82,7 +74,7 @@ def cases() -> tuple[Case, ...]:
             "torque_arm",
             "torque motors behind gears, Nm commanded",
             m.TORQUE_ARM,
-            arm(Torques(120, 12, gear=40), rate=500, seed=1),
+            arm(Torques(120, 12, gear=40), rate=250, seed=1),
             (DryFriction(("elbow",), 0.5),),
             {"elbow_link": 1.15},
         ),
@@ -90,14 +82,14 @@ def cases() -> tuple[Case, ...]:
             "torque_arm_clean",
             "the same, nothing missing",
             m.TORQUE_ARM,
-            arm(Torques(120, 12, gear=40), rate=500, seed=2),
+            arm(Torques(120, 12, gear=40), rate=250, seed=2),
             heavier={"wrist_link": 1.2},
         ),
         Case(
             "velocity_arm",
             "velocity servos, rad/s commanded",
             m.VELOCITY_ARM,
-            arm(Velocities(), rate=200, seed=3),
+            arm(Velocities(), rate=100, seed=3),
             (Late(ARM3, 0.03),),
         ),
         Case(
@@ -135,7 +127,7 @@ def cases() -> tuple[Case, ...]:
             "coupled_finger",
             "last joint coupled to the one before, not logged",
             m.COUPLED_FINGER,
-            Experiment(Positions(), ("mcp", "pip"), (0.5, 0.6), (0.5, 0.5), seed=8, logged=("mcp", "pip")),
+            Experiment(Positions(), ("mcp", "pip"), (0.5, 0.6), (0.5, 0.5), seed=8, rate=200, logged=("mcp", "pip")),
             (DryFriction(("mcp",), 0.02, width=0.02),),
         ),
         Case(
@@ -147,7 +139,7 @@ def cases() -> tuple[Case, ...]:
                 WALKER,
                 (0.6, -1.2) * 4,
                 (0.15, 0.2) * 4,
-                seconds=12,
+                seconds=10,
                 rate=100,
                 seed=9,
                 imu=True,
@@ -167,7 +159,7 @@ def cases() -> tuple[Case, ...]:
             "filtered_servos",
             "the robot's drives have a filter, the model's have none",
             m.SERVO_ARM,
-            arm(Positions(), rate=200, seed=11),
+            arm(Positions(), seed=11),
             (Lag(ARM3, 0.05),),
         ),
         Case(
@@ -223,7 +215,7 @@ def cases() -> tuple[Case, ...]:
             "cart_pole",
             "a force on a cart, and a pole that nothing drives",
             m.CART_POLE,
-            Experiment(Torques(40, 10), ("rail",), (0.0,), (0.3,), seed=17, rate=500),
+            Experiment(Torques(40, 10), ("rail",), (0.0,), (0.3,), seed=17, rate=250),
             (Viscous(("rail",), 2.5),),
         ),
     )
