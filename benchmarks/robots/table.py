@@ -26,7 +26,8 @@ def keep(work: Path, row: Mapping[str, Any]) -> None:
 
 def line(row: Mapping[str, Any]) -> str:
     """One case in a few lines of text."""
-    head = f"{row['name']:<18} {row['answer']:<10} {row['verdict']:<16} {row['seconds']:5.0f} s ({row['cpu_seconds']:.0f} CPU-s)"
+    cost = f"{row['seconds']:.0f} s ({row['cpu_seconds']:.0f} CPU-s)"
+    head = f"{row['name']:<18} {row['answer']:<10} {row['verdict']:<16} {cost}"
     if row["kind"] == "simulated":
         error = "" if row["amount_error"] is None else f", {100 * row['amount_error']:.1f} % off"
         lines = [head, f"    {row['title']}: {row['planted']}; found {row['found']}{error}"]
