@@ -214,6 +214,7 @@ def _kuka(data: Path, out: Path, limit: float) -> dict[str, Any]:
         figures.append(Figure(f"torque offset {joint}, Nm", value, interval, None, hand, None, near))
     figures += _torque_error(done, baseline.heldout, None)
     share = _share_of_range(done, model)
+    small = share is not None and share <= 0.01
     figures.append(
         Figure(
             "held-out torque error, of the limits' range",

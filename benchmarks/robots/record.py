@@ -74,17 +74,16 @@ class Velocities:
 class Torques:
     """Joint torques of a controller that follows the motion and knows the weight; behind a gear."""
 
-    kp: float
-    kd: float
+    kp: tuple[float, ...]
+    kd: tuple[float, ...]
     gear: float = 1.0
-    logged: bool = True
 
     def ctrl(self, motion: Motion, sample: int, model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
         torque = np.empty(len(motion.joints))
         for i, name in enumerate(motion.joints):
             joint = data.joint(name)
-            error = self.kp * (motion.position[sample, i] - joint.qpos[0])
-            torque[i] = error + self.kd * (motion.velocity[sample, i] - joint.qvel[0]) + joint.qfrc_bias[0]
+            error = self.kp[i] * (motion.position[sample, i] - joint.qpos[0])
+            torque[i] = error + self.kd[i] * (motion.velocity[sample, i] - joint.qvel[0]) + joint.qfrc_bias[0]
         return torque / self.gear
 
     def channels(self, motion: Motion, ctrl: FloatArray) -> dict[str, FloatArray]:

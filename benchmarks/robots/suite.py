@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 ARM3 = ("shoulder", "elbow", "wrist")
 ARM6 = ("waist", "shoulder", "elbow", "forearm", "wrist", "flange")
 LEG3 = ("roll", "hip", "knee")
+HELD = Torques((150.0, 80.0, 15.0), (15.0, 8.0, 1.2), gear=40)
+"""A controller of the arm's motors."""
 KNEES = tuple(f"{leg}_knee" for leg in ("FL", "FR", "RL", "RR"))
 WALKER = tuple(f"{leg}_{part}" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "knee"))
 TROT = tuple(phase for leg in (0.0, np.pi, np.pi, 0.0) for phase in (leg, leg + 0.5 * np.pi))
@@ -74,7 +76,7 @@ def cases() -> tuple[Case, ...]:
             "torque_arm",
             "torque motors behind gears, Nm commanded",
             m.TORQUE_ARM,
-            arm(Torques(120, 12, gear=40), rate=250, seed=1),
+            arm(HELD, rate=250, seed=1),
             (DryFriction(("elbow",), 0.5),),
             {"elbow_link": 1.15},
         ),
@@ -82,7 +84,7 @@ def cases() -> tuple[Case, ...]:
             "torque_arm_clean",
             "the same, nothing missing",
             m.TORQUE_ARM,
-            arm(Torques(120, 12, gear=40), rate=250, seed=2),
+            arm(HELD, rate=250, seed=2),
             heavier={"wrist_link": 1.2},
         ),
         Case(
@@ -215,7 +217,7 @@ def cases() -> tuple[Case, ...]:
             "cart_pole",
             "a force on a cart, and a pole that nothing drives",
             m.CART_POLE,
-            Experiment(Torques(40, 10), ("rail",), (0.0,), (0.3,), seed=17, rate=250),
+            Experiment(Torques((40.0,), (10.0,)), ("rail",), (0.0,), (0.3,), seed=17, rate=250),
             (Viscous(("rail",), 2.5),),
         ),
     )
