@@ -77,7 +77,7 @@ LEG3 = (
 PENDULUM = (Link("pendulum", "0 1 0", 0.15, 0.4, 0.004, 0.05),)
 
 TORQUE_ARM = chain(ARM3, each(ARM3, '<motor name="{j}" joint="{j}" gear="40"/>'))
-VELOCITY_ARM = chain(ARM3, each(ARM3, '<velocity name="{j}" joint="{j}" kv="25"/>'))
+VELOCITY_ARM = chain(ARM3, each(ARM3, '<velocity name="{j}" joint="{j}" kv="6"/>'))
 GEARED_ARM = chain(ARM3, each(ARM3, '<position name="{j}_servo" joint="{j}" gear="50" kp="0.06" kv="0.0024"/>'))
 SERVO_ARM = chain(ARM3, each(ARM3, '<position name="{j}" joint="{j}" kp="120" kv="5"/>'))
 BARE_ARM = chain(ARM3, "")
