@@ -1,7 +1,7 @@
 """`python -m benchmarks.robots`: robots of any drive, simulated with known truth and measured ones, through `close`.
 
-Simulated: plain MuJoCo at 0.25 ms with held commands, encoder ticks and noise; each lacks one thing in its model that
-nobody declares, or nothing. `right`: that thing, at its place, within 15 %, and nothing else; `wrong`: something is
+Simulated: steps of 0.25 ms of an integrator of our own, held commands, encoder ticks and noise; each model lacks one
+thing that nobody declares, or nothing. `right`: that thing, at its place, within 15 %, and nothing else; `wrong`: something is
 named that is not there; `not right`: all else that has a result. Measured (SYSID_BTR_DATA, else ../shared/data beside
 the checkout; left out where there are none): our figures beside published ones, those made by hand, and a linear
 regression's on the same split and signals.

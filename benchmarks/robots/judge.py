@@ -12,6 +12,9 @@ from benchmarks.robots.planted import Planted
 AMOUNT = 0.15
 """Largest relative error of an amount that is right."""
 
+EVERYWHERE = frozenset({"robot"})
+"""Place of what is no joint's own."""
+
 Answer = Literal["right", "not right", "wrong"]
 
 
@@ -48,7 +51,7 @@ def judge(result: Mapping[str, Any], planted: Sequence[Planted], alike: frozense
         own = [i for i, n in enumerate(named) if n.is_of(one, alike)]
         used.update(own)
         where = frozenset().union(*(named[i].where for i in own))
-        if not own or not (where == set(one.where) or where <= alike):
+        if not own or not (where in (EVERYWHERE, set(one.where)) or where <= alike):
             missing.append(f"{one.effect} at {', '.join(one.where)}")
             continue
         errors.append(max(named[i].error(one, alike) for i in own))
@@ -97,8 +100,7 @@ class Name:
     def is_of(self, planted: Planted, alike: frozenset[str]) -> bool:
         """Whether this is the planted effect, at its places or some of them."""
         places = set(planted.where) | (alike if alike & set(planted.where) else set())
-        everywhere = self.where in ({"robot"}, {"*"})
-        return self.kind(planted) is not None and (self.where <= places or everywhere)
+        return self.kind(planted) is not None and (self.where <= places or self.where == EVERYWHERE)
 
     def error(self, planted: Planted, alike: frozenset[str]) -> float:
         """Worst relative error of the amounts; of their sum where places are alike."""

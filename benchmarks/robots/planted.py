@@ -1,4 +1,4 @@
-"""What a simulated robot has and its model lacks: planted in plain MuJoCo, by other means than the library's."""
+"""What a simulated robot has and its model lacks: planted by other means than the library's."""
 
 from __future__ import annotations
 

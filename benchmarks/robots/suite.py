@@ -122,7 +122,7 @@ def cases() -> tuple[Case, ...]:
             "two fingers, coupled, closed by a tendon; 0..255 commanded",
             m.GRIPPER,
             Experiment(OwnControl(), ("grip",), (120.0,), (100.0,), seed=7, rate=100),
-            (DryFriction(("left", "right"), 0.8, width=0.0004),),
+            (DryFriction(("left", "right"), 0.8, width=0.002),),
             alike=frozenset({"left", "right"}),
         ),
         Case(
