@@ -1,10 +1,10 @@
 """`python -m benchmarks.robots`: robots of any drive, simulated with known truth and measured ones, through `close`.
 
 Simulated: steps of 0.25 ms of an integrator of our own, held commands, encoder ticks and noise; each model lacks one
-thing that nobody declares, or nothing. `right`: that thing, at its place, within 15 %, and nothing else; `wrong`: something is
-named that is not there; `not right`: all else that has a result. Measured (SYSID_BTR_DATA, else ../shared/data beside
-the checkout; left out where there are none): our figures beside published ones, those made by hand, and a linear
-regression's on the same split and signals.
+thing that nobody declares, or nothing. `right`: that thing, at its place, within 15 %, and nothing else; `wrong`:
+something is named that is not there; `not right`: all else that has a result. Measured (SYSID_BTR_DATA, else
+../shared/data beside the checkout; left out where there are none): our figures beside published ones, those made by
+hand, and a linear regression's on the same split and signals.
 
 Each case is kept when it is done, as one JSON in the work folder, so that an interrupted run goes on.
 """

@@ -19,7 +19,7 @@ def examine(case: Case, work: Path, limit: float) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     model, log = folder / "model.xml", folder / "log.parquet"
     model.write_text(case.model)
-    write_log(case.log(), log)
+    write_log(case.log(), log, overwrite=True)
     (folder / "truth.json").write_text(json.dumps(case.truth, indent=1) + "\n")
     done = run(("close", "--model", str(model), "--log", str(log), *case.arguments), folder / "out", limit)
     return {
