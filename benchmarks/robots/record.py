@@ -22,6 +22,8 @@ order will not do: it adds a step's length of damping to every inertia, which `c
 TICK = 2 * math.pi / 2**14
 """rad (m for slides, times `SLIDE`), of an encoder."""
 SLIDE = 0.05
+REMEMBERED = 4000
+"""Steps, 1 s, of commands that delays and filters can reach back."""
 NOISE = {"position": 2e-4, "effort": 0.02, "imu.gyro": 0.005, "imu.acc": 0.05, "imu.angle": 0.002}
 """Standard deviations; of the effort as a fraction of its rms."""
 
@@ -137,6 +139,8 @@ class Experiment:
     logged : joints whose position is logged; None: all.
     effort : joints whose torque is logged.
     silent : commands are not logged.
+    interpolated : drives go from one command to the next, and do not hold it (of commands that no sensor changes). A
+        torque that is read as a held command jumps is not the one that moved the robot.
     start : positions at rest, by joint; those of the keyframe, or zero, of others.
     imu : the base is free and has one.
     frequencies : Hz, between which the motion has its sines.
@@ -154,6 +158,7 @@ class Experiment:
     logged: tuple[str, ...] | None = None
     effort: tuple[str, ...] = ()
     silent: bool = False
+    interpolated: bool = False
     start: Mapping[str, float] = field(default_factory=dict)
     imu: bool = False
     frequencies: tuple[float, float] = (0.15, 1.2)
@@ -200,9 +205,10 @@ def record(xml: str, experiment: Experiment, planted: Sequence[Planted], heavier
     history = np.empty((0, model.nu))
     for i in range(n):
         ctrl[i, driven] = experiment.drive.ctrl(motion, i, model, data)
-        history = np.concatenate([history[-4000:], np.tile(ctrl[i], (steps, 1))])
+        ahead = experiment.drive.ctrl(motion, min(i + 1, n - 1), model, data) if experiment.interpolated else None
+        history = np.concatenate([history[-REMEMBERED:], _within(ctrl[i], driven, ahead, steps)])
         sent = _sent(history, planted)[-steps:]
-        data.ctrl[:] = sent[0]
+        data.ctrl[:] = ctrl[i] if experiment.interpolated else sent[0]
         mujoco.mj_forward(model, data)
         seen.append(_sensed(model, data))
         _advance(model, data, sent, planted)
@@ -214,6 +220,14 @@ def record(xml: str, experiment: Experiment, planted: Sequence[Planted], heavier
     mount = "free" if experiment.imu else "fixed"
     meta = LogMeta(robot="", mount=mount, sample_period=1 / experiment.rate, source="simulated", **experiment.meta)
     return Log(motion.time, channels, meta, np.zeros(n, dtype=np.int64))
+
+
+def _within(ctrl: FloatArray, driven: list[int], ahead: FloatArray | None, steps: int) -> FloatArray:
+    """(steps, nu) ctrl until the next sample: held, or on the way to what is commanded then."""
+    rows = np.tile(ctrl, (steps, 1))
+    if ahead is not None:
+        rows[:, driven] += (ahead - ctrl[driven]) * ((np.arange(steps) + 0.5) / steps)[:, None]
+    return rows
 
 
 def _robot(xml: str, planted: Sequence[Planted], heavier: Mapping[str, float]) -> mujoco.MjModel:

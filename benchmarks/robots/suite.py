@@ -200,7 +200,7 @@ def cases() -> tuple[Case, ...]:
             "no_command",
             "positions and torques alone",
             m.BARE_ARM,
-            arm(Positions(), seed=15, rate=500, effort=ARM3, silent=True),
+            arm(Positions(), seed=15, rate=500, effort=ARM3, silent=True, interpolated=True),
             (DryFriction(("shoulder", "elbow"), 0.8),),
             {"elbow_link": 1.2},
             robot=m.SERVO_ARM,
