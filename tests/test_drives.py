@@ -28,6 +28,7 @@ from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.friction import StribeckFriction
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.transmission import Backlash
 
 STEP = 0.002
 NUMERICS = Numerics("implicitfast", STEP)
@@ -326,6 +327,30 @@ def test_a_joint_that_is_not_logged_stands_where_it_is_said_to() -> None:
         start(replace(robot, at=(("wrist", 1.0),)), log)
     with pytest.raises(ModelError, match="its keyframes: a, b"):
         start(replace(robot, at=(("keyframe:c", 0.0),)), log)
+
+
+QUADRUPED = """
+<mujoco>
+  <worldbody>
+    <body name="trunk" pos="0 0 .4"><freejoint/><geom type="box" size=".1 .1 .05" mass="3"/>
+      <body name="leg"><joint name="hip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/></body>
+    </body>
+  </worldbody>
+  <actuator><position name="hip" joint="hip" kp="20" kv="1"/><motor name="push" site="tip"/></actuator>
+  <keyframe><key name="home" qpos="0 0 .3 1 0 0 0 0.6" ctrl="0.6 0.2"/></keyframe>
+</mujoco>
+"""
+
+
+def test_a_keyframe_of_a_floating_robot_holds_for_one_that_hangs_and_for_one_with_play() -> None:
+    tip = '<geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/><site name="tip" pos="0 0 -.2"/>'
+    robot = robot_from_xml(QUADRUPED.replace('<geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/>', tip))
+    log = commands(command__hip=0.6 + 0 * TIME)
+    for terms in ((), (Backlash(("hip",)),)):
+        replay = Replay(robot, log, terms, NUMERICS)
+        assert replay.start[0].tolist() == [0.6]
+        assert replay.idle[1] == {"push": 0.2}
+        assert replay.grid.extra[0].tolist() == [0.2]
 
 
 def test_a_servo_without_a_command_holds_its_joint_where_it_stands() -> None:

@@ -163,6 +163,7 @@ class Drifting:
         (Broken(late), "commands"),
         (Broken(mixed), "commands"),
         (Broken(like_the_first), "commands"),
+        (Broken(lambda setup: replace(setup, control=None)), "of other actuators"),
         (Broken(lambda setup: replace(setup, applied=None)), "torques known in advance"),
         (Broken(without_fields), "fields"),
         (Broken(without("xfrc_applied")), "initial states and forces"),

@@ -50,6 +50,9 @@ def compile_model(robot: Robot, log: Log, terms: Sequence[Term], numerics: Numer
     for joint in spec.joints:
         joint.solref_friction = [constant, 1.0]
         joint.solimp_friction = [0.99, 0.999, 0.001, 0.5, 2.0]
+    for key in list(spec.keys):
+        # the plain model's say where joints stand; of another structure they would be invalid
+        spec.delete(key)
     _filter_commands(spec)
     for term in terms:
         term.edit_spec(spec)

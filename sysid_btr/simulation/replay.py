@@ -111,8 +111,8 @@ class Replay:
 
         A position servo holds its joint where it starts; others do what the model's keyframe says, or nothing.
         """
-        index, model = self.index, self.model
-        ctrl = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
+        index, plain = self.index, self.robot.model
+        ctrl = plain.key_ctrl[0] if plain.nkey else np.zeros(plain.nu)
         driven = index.actuator >= 0
         kept = np.zeros(len(index.joints))
         kept[driven] = ctrl[index.actuator[driven]]

@@ -27,6 +27,13 @@ SLIDERS = """<mujoco><option gravity="0 0 -9.81" timestep="{step}" integrator="{
   <actuator><motor joint="b"/><motor joint="a"/></actuator></mujoco>"""
 """Two masses that feel nothing but gravity and their motors, which are not in the order of the joints."""
 
+GEARED = SLIDERS.replace(
+    '<actuator><motor joint="b"/><motor joint="a"/>',
+    """<tendon><fixed name="sum"><joint joint="a" coef="1"/><joint joint="b" coef="2"/></fixed></tendon>
+  <actuator><motor joint="b" gear="-4"/><motor name="sum" tendon="sum"/><general joint="a" gainprm="5"/>""",
+)
+"""The same with a gear and a gain, and an actuator that pulls at both."""
+
 SPRING = """<mujoco><option gravity="0 0 0" timestep="{step}" integrator="{integrator}"/><worldbody>
   <body><joint name="a" type="slide" stiffness="200"/><geom size=".1" mass="2"/></body></worldbody></mujoco>"""
 """A mass on a spring, at 10 rad/s."""
@@ -102,9 +109,15 @@ def check_order(simulator: Simulator) -> None:
 
 
 def check_commands(simulator: Simulator) -> None:
-    """Every row of commands, at every step, reaches the motor of its own joint."""
+    """Every row of commands, at every step, reaches the motor of its own joint, in units of the joint.
+
+    Actuators that are commanded by their own name get their ctrl.
+    """
     force = np.random.default_rng(0).uniform(-1, 1, (3, STEPS, 2))
     _fly(simulator, _setup(_batch(SLIDERS, 3), STEPS, command=force), force, "commands")
+    control = np.random.default_rng(1).uniform(-1, 1, (3, STEPS, 1))
+    setup = _setup(_batch(GEARED, 3), STEPS, command=force, control=control)
+    _fly(simulator, setup, force + control * [1.0, 2.0], "commands by gears, and of other actuators")
 
 
 def check_applied(simulator: Simulator) -> None:
