@@ -206,7 +206,7 @@ def _possible(name: str, kind: Kind, stated: tuple[float, float]) -> tuple[float
 def _own_bounds(
     name: str, field: str, place: str, table: Mapping[str, tuple[float, float]]
 ) -> tuple[float, float] | None:
-    for key in (name, f"{field}:{place}", field):
+    for key in (name, f"{field}:{place}", name.partition(":")[0], field):
         if key in table:
             return table[key]
     return None
