@@ -16,7 +16,7 @@ from sysid_btr.floating_base.estimate import BaseState, estimate_base, find_cont
 from sysid_btr.floating_base.events import FALLEN, Event, find_fall, find_pickups, find_slips, usable
 from sysid_btr.floating_base.feet import force_columns, points_in_base, touching_bodies
 from sysid_btr.floating_base.size import NAO, BodySize, measure_size
-from sysid_btr.floating_base.smoothing import smooth_joints
+from sysid_btr.identify.smoothing import smooth_joints
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot

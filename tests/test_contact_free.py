@@ -21,7 +21,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.segments import BASE, Segments
+from sysid_btr.simulation.segments import BASE, BaseStates, Segments
 
 MASSES = ["mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"]
 
@@ -33,7 +33,8 @@ def random_states(n: int, joints: int, rng: np.random.Generator) -> Segments:
     three = (rng.normal(size=(n, 3)) for _ in range(3))
     position, velocity, rate = three
     q, dq = rng.normal(size=(2, n, joints))
-    return Segments(rows, position, quaternion, velocity, rate, q, dq, np.ones((n, BASE + 2 * joints)))
+    base = BaseStates(position, quaternion, velocity, rate)
+    return Segments(rows, q, dq, np.ones((n, BASE + 2 * joints)), base)
 
 
 def problem_of(study: Study, values: dict[str, float] | None = None) -> tuple[ReplayProblem, np.ndarray]:

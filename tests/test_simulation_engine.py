@@ -36,7 +36,7 @@ from sysid_btr.simulation.batching import batched_chunks, group_replays
 from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps, step_inputs
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.simulation.segments import SegmentReplay, Segments
+from sysid_btr.simulation.segments import BaseStates, SegmentReplay, Segments
 from sysid_btr.simulation.start import initial_state
 from sysid_btr.terms.friction import CoulombFriction, StribeckFriction
 from sysid_btr.terms.grammar import parse_parameters
@@ -419,7 +419,8 @@ def test_a_law_in_a_segment_reads_the_inputs_of_its_own_time() -> None:
     def segment(log: Log, first: int) -> np.ndarray:
         start, rows = np.array([[0.0, 0.0, 1.0]]), np.array([[first, first + 20]])
         still, joint = np.zeros((1, 3)), np.full((1, 1), 0.5)
-        segments = Segments(rows, start, np.eye(1, 4), still, still, joint, 8 * joint, np.ones((1, 14)))
+        base = BaseStates(start, np.eye(1, 4), still, still)
+        segments = Segments(rows, joint, 8 * joint, np.ones((1, 14)), base)
         replay = SegmentReplay(robot_from_xml(STANDING), log, (law,), FINE, segments=segments)
         return replay.predict(np.full((1, 1), 0.5)).position[0, first : first + 20]
 

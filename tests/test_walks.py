@@ -19,8 +19,7 @@ from sysid_btr.floating_base import segments as segments_module
 from sysid_btr.floating_base.contact_free import without_ground
 from sysid_btr.floating_base.episode import FloatingEpisode, reconstruct
 from sysid_btr.floating_base.estimate import BaseState
-from sysid_btr.floating_base.initial_states import start_lanes
-from sysid_btr.floating_base.segments import SegmentLength, covered, segment_best, segment_log, segment_seconds
+from sysid_btr.floating_base.segments import FloatingReplay, SegmentLength, segment_best, segment_log
 from sysid_btr.floating_base.size import measure_size
 from sysid_btr.floating_base.strides import of_legs, repeated_error, stride
 from sysid_btr.identify.deferred import deferred_fit
@@ -36,7 +35,7 @@ from sysid_btr.models.gait import Gait, gait
 from sysid_btr.objectives.marginal import Marginal, projections
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments, on_slope
+from sysid_btr.simulation.segments import BASE, BaseStates, Segments, covered, on_slope, segment_seconds
 from sysid_btr.terms.contact import FootCompliance, FootFriction
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
@@ -60,23 +59,20 @@ def true_segments(
     a = rows[:, 0]
     return Segments(
         rows,
-        truth.position[a],
-        quaternion,
-        truth.velocity[a],
-        truth.rate[a],
         truth.joint_position[a][:, order],
         truth.joint_velocity[a][:, order],
         np.full((len(rows), BASE + 2 * len(order)), 1e-3),
+        BaseStates(truth.position[a], quaternion, truth.velocity[a], truth.rate[a]),
     )
 
 
-def window_replay(log: Log, truth: Truth, *terms: object, **kwargs: object) -> SegmentReplay:
+def window_replay(log: Log, truth: Truth, *terms: object, **kwargs: object) -> FloatingReplay:
     robot = load_robot("nao")
-    bare = SegmentReplay(robot, log, tuple(terms), FINE, threads=1)  # type: ignore[arg-type]
+    bare = FloatingReplay(robot, log, tuple(terms), FINE, threads=1)  # type: ignore[arg-type]
     return replace(bare, segments=true_segments(log, truth, bare.index.joints, **kwargs))  # type: ignore[arg-type]
 
 
-def joint_truth(truth: Truth, replay: SegmentReplay) -> np.ndarray:
+def joint_truth(truth: Truth, replay: FloatingReplay) -> np.ndarray:
     return truth.joint_position[:, [truth.joints.index(j) for j in replay.index.joints]]
 
 
@@ -162,7 +158,7 @@ def test_samples_between_steps_are_read_where_they_are() -> None:
 def test_coordinates_of_a_start_share_simulations_only_in_limbs_without_a_foot() -> None:
     log, truth = quiet_walk()
     replay = window_replay(log, truth)
-    lanes = start_lanes(replay)
+    lanes = replay.lanes()
     seen = [c for lane in lanes for c, _ in lane]
     joints = len(replay.index.joints)
     assert sorted(seen) == sorted({2, 3, 4, *range(6, BASE + 2 * joints)})  # all but place and yaw
@@ -190,8 +186,8 @@ def test_on_a_slope_gravity_and_the_base_tilt_together() -> None:
     unit = np.array([[0.0, 0.0, -9.81]])
     x, y = tilt
     own = 9.81 * np.array([-np.sin(y) * np.cos(x), np.sin(x), -np.cos(y) * np.cos(x)])
-    back = on_slope(replay.segments, own, np.repeat(unit, len(replay.segments), axis=0))
-    outputs = replace(replay, segments=back).predict(np.array([[0.0, 0.0], tilt]))
+    back = on_slope(replay.segments.free_base, own, np.repeat(unit, len(replay.segments), axis=0))
+    outputs = replace(replay, segments=replace(replay.segments, base=back)).predict(np.array([[0.0, 0.0], tilt]))
     inside = np.isfinite(outputs.position[0, :, 0])
     flat, sloped = (np.sqrt(np.mean((p[inside] - joint_truth(truth, replay)[inside]) ** 2)) for p in outputs.position)
     assert sloped < 0.3 * flat
@@ -283,7 +279,10 @@ def test_the_fitted_and_the_held_out_part_of_a_walk_have_the_segments_that_lie_i
     assert len(fitted.base.time) == len(fitted.log)
     every = segment_log(held_out.log, held_out.base, 0.2, (held_out.begin,))
     assert np.array_equal(np.concatenate([fitted.segments.rows, held_out.segments.rows]), every.rows)
-    assert np.array_equal(np.concatenate([fitted.segments.position, held_out.segments.position]), every.position)
+    assert np.array_equal(
+        np.concatenate([fitted.segments.free_base.position, held_out.segments.free_base.position]),
+        every.free_base.position,
+    )
     assert not np.any(fitted.compared & held_out.compared[: len(fitted.log)])
     assert fitted.compared[fitted.segments.rows[:, 0]].all()
     assert held_out.compared[held_out.segments.rows[:, 0]].all()
@@ -509,8 +508,8 @@ def test_a_free_and_a_held_log_are_fitted_together() -> None:
     study = make_study(load_robot("nao"), [log, held], numerics=Numerics("RK4", 0.005), threads=2)
     problem = study.train_problem(study.declare(["mass:LKneePitch", "mass:RShoulderRoll"]))
     walk, gantry = (e.replay for e in problem.episodes)
-    assert isinstance(walk, SegmentReplay)
-    assert not isinstance(gantry, SegmentReplay)
+    assert isinstance(walk, FloatingReplay)
+    assert not isinstance(gantry, FloatingReplay)
     assert walk.model.nq == gantry.model.nq + 7
     # a free base lets every parameter reach every joint
     assert all(len(group) == 1 for group in problem.groups)

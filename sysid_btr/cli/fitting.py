@@ -104,7 +104,7 @@ class Run:
             holdout=read_holdout(self.options.holdout, self.options),
             channels=self.options.channels or FITTED,
             simulator=self.options.simulator,
-            mode=Mode(self.options.mode),
+            mode=Mode(self.options.mode, self.options.segments),
             threads=self.options.threads,
             executor=executor,
         )

@@ -95,10 +95,17 @@ class ModeOptions(Options):
 
     mode: str = option(
         "auto",
-        "How logs are compared: forward drives the model by their commands, inverse compares the torques that "
-        "the motion takes.",
-        otherwise="auto: inverse where no command is logged",
-        metavar="auto|forward|inverse",
+        "How logs are compared: forward drives the model by their commands, segments does so from one measured state "
+        "after the other, inverse compares the torques that the motion takes.",
+        otherwise="auto: inverse where no command is logged, segments where the replay goes its own way",
+        metavar="auto|forward|segments|inverse",
+        decides=True,
+    )
+    segments: str = option(
+        "auto",
+        "Length of the segments of a robot whose base is fixed; whole replays the log from its first sample.",
+        otherwise="auto: as long as the plain model can be followed",
+        metavar="whole|auto|SECONDS",
         decides=True,
     )
 

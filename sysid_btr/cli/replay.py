@@ -107,7 +107,7 @@ def _compare(
         channels=COMPARED,
         numerics=numerics,
         simulator=options.simulator,
-        mode=Mode(options.mode),
+        mode=Mode(options.mode, options.segments),
         threads=threads,
     )
     scores = score_problem(study.train_problem(model), model.values)

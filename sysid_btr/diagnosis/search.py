@@ -129,6 +129,9 @@ def _promising(state: State, library: Library, rules: Selection) -> tuple[list[H
 def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensitivity], int]:
     """What every effect would do to the residual, best first, and the number of residuals."""
     study, model = state.study, state.fitted.model
+    if study.procedure.shares:
+        # what is missing acts in proportion on short segments alone
+        study = study.with_share(study.procedure.shares[0], model)
     problem = shorten(study, rules.scan_seconds).train_problem(model)
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
     asked = _perturbations(state, library, problem, residual, rules)

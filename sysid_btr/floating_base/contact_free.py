@@ -29,7 +29,7 @@ from sysid_btr.objectives.covariance import Known, covariance
 from sysid_btr.objectives.problem import BLOCK, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid
-from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments
+from sysid_btr.simulation.segments import BASE, BaseStates, SegmentReplay, Segments
 from sysid_btr.simulation.silence import silenced
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class SampleSteps(FloatingReplay):
         base[failed, 3:7] = 1.0, 0.0, 0.0, 0.0
         std = np.zeros((size, BASE + 2 * j))
         rows = np.asarray(self._segments.rows[segment])
-        return Segments(rows, base[:, :3], base[:, 3:7], base[:, 7:10], base[:, 10:], q, dq, std)
+        return Segments(rows, q, dq, std, BaseStates(base[:, :3], base[:, 3:7], base[:, 7:10], base[:, 10:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,8 +391,8 @@ def _blows(chain: _Chain, values: FloatArray) -> FloatArray:
     jacobian, blow = np.zeros((len(steps.feet), 6, model.nv)), np.zeros((6 * len(steps.feet), model.nv))
     result = np.zeros((len(states), states.std.shape[1], len(blow)))
     for k in range(len(states)):
-        data.qpos[place : place + 3] = states.position[k]
-        data.qpos[place + 3 : place + 7] = states.quaternion[k]
+        data.qpos[place : place + 3] = states.free_base.position[k]
+        data.qpos[place + 3 : place + 7] = states.free_base.quaternion[k]
         data.qpos[index.qpos] = states.joint_position[k]
         mujoco.mj_fwdPosition(model, data)
         for own, body in zip(jacobian, steps.feet, strict=True):
@@ -404,13 +404,14 @@ def _blows(chain: _Chain, values: FloatArray) -> FloatArray:
 
 def difference(a: Segments, b: Segments) -> FloatArray:
     """(w, d) change that takes states `b` to `a`, in the coordinates of `Segments.std`."""
-    turned, from_here = (to_rotation(s.quaternion) for s in (a, b))
+    there, here = a.free_base, b.free_base
+    turned, from_here = (to_rotation(base.quaternion) for base in (there, here))
     return np.concatenate(
         [
-            a.position - b.position,
+            there.position - here.position,
             (from_here.inv() * turned).as_rotvec(),
-            a.velocity - b.velocity,
-            a.rate - b.rate,
+            there.velocity - here.velocity,
+            there.rate - here.rate,
             a.joint_position - b.joint_position,
             a.joint_velocity - b.joint_velocity,
         ],
@@ -514,14 +515,14 @@ def _measurements(chain: _Chain) -> tuple[FloatArray, FloatArray]:
     """Whitened derivatives (n, m, d) of what is measured by the states, and what they leave of it, (n, m)."""
     states = chain.states
     n, j = states.joint_position.shape
-    up = to_rotation(states.quaternion).as_matrix()[:, 2]
+    up = to_rotation(states.free_base.quaternion).as_matrix()[:, 2]
     sight = np.zeros((n, j + 5, states.std.shape[1]))
     sight[:, np.arange(j), BASE + np.arange(j)] = 1.0
     sight[:, j + np.arange(3), 9 + np.arange(3)] = 1.0
     # a small turn r of the base moves the vertical in its frame by up x r
     sight[:, j + 3, 4], sight[:, j + 3, 5] = -up[:, 2], up[:, 1]
     sight[:, j + 4, 3], sight[:, j + 4, 5] = up[:, 2], -up[:, 0]
-    left = np.concatenate([states.joint_position, states.rate, up[:, :2]], axis=1) - chain.measured
+    left = np.concatenate([states.joint_position, states.free_base.rate, up[:, :2]], axis=1) - chain.measured
     return sight / chain.sigma[:, :, None], left / chain.sigma
 
 

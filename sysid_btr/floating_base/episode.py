@@ -12,21 +12,18 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError
 from sysid_btr.floating_base.estimate import BaseState, estimate_base
 from sysid_btr.floating_base.fusion import WIDE_STEP, fuse
-from sysid_btr.floating_base.initial_states import update_initial_states
 from sysid_btr.floating_base.segments import (
     FASTEST,
     FloatingReplay,
     SegmentLength,
-    covered,
     segment_best,
     segment_log,
     segment_numerics,
-    segment_seconds,
-    spread_evenly,
     whole_step,
 )
 from sysid_btr.identify.deferred import LEAST_GAIN
 from sysid_btr.identify.episode import E, Episode, Fused, Inflation, Procedure
+from sysid_btr.identify.initial_states import update_initial_states
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split
 from sysid_btr.models.robot import Robot
@@ -34,7 +31,7 @@ from sysid_btr.objectives.marginal import Marginal
 from sysid_btr.objectives.problem import BLOCK, Comparison, ReplayProblem
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
-from sysid_btr.simulation.segments import Segments
+from sysid_btr.simulation.segments import Segments, covered, segment_seconds, spread_evenly
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Terms
 
@@ -180,7 +177,7 @@ class FloatingEpisode(Episode):
         comparison = compare()
         assert isinstance(comparison.replay, FloatingReplay)
         segments, marginal = update_initial_states(
-            comparison.replay, comparison.targets, self.marginal, values, coarse, anew=anew
+            comparison.replay, comparison.targets, self.marginal, values, coarse, anew=anew, weigh=True
         )
         return replace(self, segments=segments, marginal=marginal)
 

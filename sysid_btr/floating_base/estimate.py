@@ -20,7 +20,7 @@ from sysid_btr.floating_base.events import Event, find_fall, find_pickups, find_
 from sysid_btr.floating_base.feet import Foot, base_body, force_columns, points_in_base, touching_bodies
 from sysid_btr.floating_base.orientation import smooth_orientation, up_in_base
 from sysid_btr.floating_base.size import BodySize, measure_size
-from sysid_btr.floating_base.smoothing import Tracks, smooth, smooth_joints
+from sysid_btr.identify.smoothing import Tracks, smooth, smooth_joints
 from sysid_btr.io.noise import noise_floor
 from sysid_btr.mujoco_conventions import to_quaternion
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.floating_base.smoothing import smooth
+from sysid_btr.identify.smoothing import smooth
 
 PASSES = 3
 DRIFT = 0.002

@@ -8,18 +8,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
 from sysid_btr.floating_base.estimate import BaseState
-from sysid_btr.floating_base.initial_states import respond
+from sysid_btr.floating_base.feet import touching_bodies, up_to_base
 from sysid_btr.floating_base.size import BodySize
+from sysid_btr.identify.initial_states import respond
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import channel_noise
 from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import make_targets
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
-from sysid_btr.simulation.segments import SegmentReplay, Segments
+from sysid_btr.simulation.segments import (
+    BASE,
+    BaseStates,
+    SegmentReplay,
+    Segments,
+    covered,
+    segment_seconds,
+    spread_evenly,
+)
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms
@@ -44,6 +53,27 @@ class FloatingReplay(SegmentReplay):
     """
 
     base: BaseState | None = None
+
+    def lanes(self) -> list[list[tuple[int, IntArray]]]:
+        """Limbs without a foot hang on the base; what happens in one of them hardly moves the others."""
+        model, index = self.model, self.index
+        joints = len(index.joints)
+        everything = np.arange(joints)
+        feet = {model.body(f.name).id for f in touching_bodies(model)}
+        standing = {up_to_base(model, b)[-1] for b in feet}
+        own = [up_to_base(model, int(b))[-1] for b in index.body]
+        # where a robot stands and where it looks changes nothing
+        lanes = [[(c, everything)] for c in (2, 3, 4, *range(6, BASE))]
+        hanging: dict[int, list[int]] = {}
+        for j, b in enumerate(own):
+            if b in standing:
+                lanes += [[(BASE + j, everything)], [(BASE + joints + j, everything)]]
+            else:
+                hanging.setdefault(b, []).append(j)
+        for k in range(max((len(m) for m in hanging.values()), default=0)):
+            members = [(m[k], np.array(m)) for m in hanging.values() if k < len(m)]
+            lanes += [[(BASE + j, seen) for j, seen in members], [(BASE + joints + j, seen) for j, seen in members]]
+        return lanes
 
 
 def segment_log(
@@ -99,40 +129,8 @@ def starts_at(base: BaseState, rows: IntArray) -> Segments:
     )
     # where a robot stands and where it looks changes nothing
     std[:, [0, 1]] = 0.0
-    return Segments(
-        rows,
-        base.position[first],
-        base.quaternion[first],
-        base.velocity[first],
-        base.rate[first],
-        base.joint_position[first],
-        base.joint_velocity[first],
-        std,
-    )
-
-
-def segment_seconds(segments: Segments, log: Log) -> float:
-    """Length of a segment, s; 0 where there is none."""
-    if len(segments) == 0:
-        return 0.0
-    a, b = segments.rows[0]
-    return float((log.time[b - 1] - log.time[a]) * (b - a) / max(b - a - 1, 1))
-
-
-def spread_evenly(segments: Segments, log: Log, seconds: float) -> IntArray:
-    """Which segments (k,) to take for no more than so many seconds of them, spread evenly over the log."""
-    if len(segments) == 0:
-        return np.arange(0)
-    count = int(np.clip(round(seconds / segment_seconds(segments, log)), 1, len(segments)))
-    return np.unique(np.linspace(0, len(segments) - 1, count).astype(np.int64))
-
-
-def covered(segments: Segments, samples: int) -> BoolArray:
-    """(n,) whether a sample of a log lies in a segment."""
-    result = np.zeros(samples, dtype=bool)
-    for a, b in segments.rows:
-        result[a:b] = True
-    return result
+    states = BaseStates(base.position[first], base.quaternion[first], base.velocity[first], base.rate[first])
+    return Segments(rows, base.joint_position[first], base.joint_velocity[first], std, states)
 
 
 def whole_step(period: float, longest: float) -> float:
@@ -213,7 +211,7 @@ def choose_length(
         except LogError:
             continue
         segments = segments.chosen(spread_evenly(segments, log, TRIED * seconds))
-        replay = SegmentReplay(robot.for_log(log), log, tuple(terms), numerics, threads=threads, segments=segments)
+        replay = FloatingReplay(robot.for_log(log), log, tuple(terms), numerics, threads=threads, segments=segments)
         inside = covered(segments, len(log))[:, None]
         targets = tuple(
             replace(t, mask=t.mask & inside) for t in make_targets(log, replay.index.joints, ("position",), 0.0)

@@ -6,12 +6,12 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.floating_base.feet import base_body, touching_bodies, up_to_base
-from sysid_btr.floating_base.segments import FEWEST, segment_seconds
+from sysid_btr.floating_base.segments import FEWEST, FloatingReplay
 from sysid_btr.floating_base.size import BodySize, measure_size
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.covariance import covariance, spread
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.segments import SegmentReplay
+from sysid_btr.simulation.segments import segment_seconds
 
 
 def repeated_error(problem: ReplayProblem, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
@@ -52,7 +52,7 @@ SHORT = 8
 
 def of_legs(problem: ReplayProblem) -> BoolArray:
     """(p,) whether a parameter is of a body between the base and the ground of a walk, or of the ground itself."""
-    walk = next((e.replay for e in problem.episodes if isinstance(e.replay, SegmentReplay)), None)
+    walk = next((e.replay for e in problem.episodes if isinstance(e.replay, FloatingReplay)), None)
     if walk is None:
         return np.zeros(len(problem.parameters), dtype=bool)
     model = walk.model
@@ -85,10 +85,10 @@ def _phases(problem: ReplayProblem) -> IntArray | None:
     labels, found, first = [], False, 0
     for comparison in problem.episodes:
         replay, log = comparison.replay, comparison.replay.log
-        length = stride(log, measure_size(replay.model)) if isinstance(replay, SegmentReplay) else None
+        length = stride(log, measure_size(replay.model)) if isinstance(replay, FloatingReplay) else None
         # what repeats in no stride is in pieces of its own
         phase = ((log.time - log.time[0]) / (2 * comparison.stretch)).astype(np.int64)
-        if length is not None and isinstance(replay, SegmentReplay) and replay.segments is not None:
+        if length is not None and isinstance(replay, FloatingReplay) and replay.segments is not None:
             found = True
             count = max(round(length / segment_seconds(replay.segments, log)), FEWEST)
             for a, b in replay.segments.rows:

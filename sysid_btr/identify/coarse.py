@@ -60,6 +60,8 @@ def first_fit(study: Study, model: Model, budget: Budget) -> tuple[Study, Fitted
     study = replace(study, numerics=study.coarse)
     model = model.at(best_start(study, model.terms, contact_starts(model)))
     for turn, iterations in enumerate(procedure.alternations, 1):
+        if procedure.shares:
+            study = study.with_share(procedure.shares[turn - 1], model)
         found = refit(study, model, iterations=iterations, budget=budget.after(spent))
         model, spent = found.model, spent + found.evaluations
         last = turn == len(procedure.alternations)

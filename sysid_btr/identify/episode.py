@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
-from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import ModelError
 from sysid_btr.estimators.base import ResidualEstimator
 from sysid_btr.estimators.lsq import LeastSquares
@@ -68,6 +68,7 @@ class Procedure:
     demand : of several kinds in one study the most demanding one's procedure is followed.
     alternations : iterations of the first fits by the coarse integrator, after each of which the initial states are
         updated.
+    shares : lengths of segment in these, as fractions of the whole one.
     coarse_suffices : whether a fit by the coarse integrator need not be repeated by the reference one before its
         errors are judged.
     deferred : whether derivatives are always taken by a cheaper integrator.
@@ -84,6 +85,7 @@ class Procedure:
 
     demand: ClassVar[int] = 0
     alternations: ClassVar[tuple[int, ...]] = ()
+    shares: ClassVar[tuple[float, ...]] = ()
     coarse_suffices: ClassVar[bool] = False
     deferred: ClassVar[bool] = False
     refines_step: ClassVar[bool] = True
@@ -220,6 +222,11 @@ class Episode(ABC):
         index, given = replay.index, driven_by_effort(self.log, replay.robot.model)
         return np.asarray((index.actuator >= 0) & [joint not in given for joint in index.joints])
 
+    @property
+    def breaks(self) -> IntArray:
+        """Samples of `log` at which its replay begins anew."""
+        return np.zeros(0, dtype=np.int64)
+
     def scoring(self, scored: BoolArray) -> Self:
         """The same with other samples that count."""
         return replace(self, scored=scored)
@@ -246,6 +253,10 @@ class Episode(ABC):
         coarse : integrator and step for derivatives with respect to the initial states.
         anew : whether derivatives that are known are taken again.
         """
+        return self
+
+    def with_share(self, share: float) -> Self:
+        """The same with segments of a fraction of their length, if that can be chosen."""
         return self
 
     def with_later_segments(self) -> Self:

@@ -13,18 +13,21 @@ import numpy as np
 
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.episode import Episode
+from sysid_btr.identify.horizon import is_held
+from sysid_btr.identify.segmented import follow
 from sysid_btr.io.log import Log
 from sysid_btr.models.commands import FED_FORWARD
 from sysid_btr.models.robot import Robot, joint_names
 
-AUTO = "auto"
+AUTO, WHOLE = "auto", "whole"
 KINDS = {
     "forward": "sysid_btr.identify.episode:FixedEpisode",
+    "segments": "sysid_btr.identify.segmented:SegmentedEpisode",
     "inverse": "sysid_btr.identify.inverse:InverseEpisode",
     "floating": "sysid_btr.floating_base.episode:FloatingEpisode",
 }
 """Mode -> its kind of episode, by name: floating bases are a wing above this one."""
-MODES = (AUTO, "forward", "inverse")
+MODES = (AUTO, "forward", "segments", "inverse")
 """What can be asked for; a floating base has a mode of its own."""
 
 
@@ -35,18 +38,39 @@ class Mode:
     Attributes
     ----------
     name : one of `MODES`.
+    segments : ``whole`` for none, ``auto`` for what the log allows, or the length of one in s; of a fixed base.
 
     Raises
     ------
     UsageError
-        If there is no such mode.
+        If there is no such mode, or segments do not go with it.
     """
 
     name: str = AUTO
+    segments: str = AUTO
 
     def __post_init__(self) -> None:
         if self.name not in MODES:
             raise UsageError(f"--mode {self.name}: choose one of {', '.join(MODES)}")
+        if self.segments not in (AUTO, WHOLE) and not self.seconds > 0:
+            raise UsageError(f"--segments {self.segments}: choose {WHOLE}, {AUTO}, or a length in s")
+        if self.segments != AUTO and self.name not in (AUTO, "forward" if self.segments == WHOLE else "segments"):
+            raise UsageError(f"--segments {self.segments} does not go with --mode {self.name}")
+
+    @property
+    def seconds(self) -> float:
+        """Length of a segment that is asked for, s; NaN where none is."""
+        try:
+            return float(self.segments)
+        except ValueError:
+            return float("nan")
+
+    @property
+    def asked(self) -> str:
+        """The mode, where segments say it."""
+        if self.segments == AUTO:
+            return self.name
+        return "forward" if self.segments == WHOLE else "segments"
 
 
 AUTOMATIC = Mode()
@@ -61,8 +85,8 @@ def episode_of(robot: Robot, log: Log, mode: Mode, threads: int = 0) -> Episode:
     UsageError
         If the log does not suit the mode.
     """
-    name, why = _resolve(robot, log, mode)
-    whole: Episode = _kind(name).whole(robot, log, threads)
+    name, why = _resolve(robot, log, mode, threads)
+    whole: Episode = _kind(name).whole(robot, log, threads, **_length(name, mode))
     return replace(whole, why=why)
 
 
@@ -76,26 +100,36 @@ def split_episode(robot: Robot, log: Log, holdout: float, mode: Mode, threads: i
     LogError
         If a part would be too short, or the base cannot be reconstructed.
     """
-    name, why = _resolve(robot, log, mode)
-    fitted, held = _kind(name).split(robot, log, holdout, threads)
+    name, why = _resolve(robot, log, mode, threads)
+    fitted, held = _kind(name).split(robot, log, holdout, threads, **_length(name, mode))
     return replace(fitted, why=why), replace(held, why=why)
 
 
-def _resolve(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
+def _length(name: str, mode: Mode) -> dict[str, float]:
+    """The length of segments that is asked for, where it is."""
+    return {"seconds": mode.seconds} if name == "segments" and mode.seconds > 0 else {}
+
+
+def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str]:
     """The mode of one log, and why."""
     if log.meta.mount == "free":
-        if mode.name not in (AUTO, "forward"):
+        if mode.asked not in (AUTO, "forward"):
             raise UsageError(
-                f"--mode {mode.name}: {log.path or 'the log'} is of a floating base, which is replayed by segments of "
+                f"--mode {mode.asked}: {log.path or 'the log'} is of a floating base, which is replayed by segments of "
                 "its own"
             )
         return "floating", "its base floats"
-    if mode.name != AUTO:
-        return mode.name, "as asked for"
+    if mode.asked != AUTO:
+        return mode.asked, "as asked for"
     joints = joint_names(robot)
     if not _commanded(log) and any(log.has("effort", j) for j in joints):
         return "inverse", "no command is logged"
-    return "forward", ""
+    if is_held(robot, log):
+        return "forward", ""
+    followed = follow(robot, log, threads)
+    if followed.open_loop:
+        return "forward", ""
+    return "segments", f"open loop, the plain model can be followed for {followed.seconds:.2g} s"
 
 
 def _commanded(log: Log) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -43,23 +44,46 @@ def choose_numerics(robot: Robot, log: Log, threads: int = 0, simulator: str = M
     ModelError
         If the plain model diverges at every step.
     """
-    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
     if log.meta.servo_period:
         return Numerics("Euler", float(log.meta.servo_period), simulator=simulator), float("nan")
-    sample = float(np.median(np.diff(log.time)))
-    chosen = Numerics("RK4", _divisor(sample, COARSEST), simulator=simulator)
-    now = _positions(robot, part, chosen, threads)
+    part = log.window(0, max(int(np.searchsorted(log.time, log.time[0] + CHECK_SECONDS)), 2))
+    chosen, error = converged(largest_step(log, simulator), lambda n: _positions(robot, part, n, threads), part)
+    if not np.isfinite(error):
+        raise ModelError(
+            f"model {robot.name}: the replay of {log.path or 'the log'} diverges even with a step of "
+            f"{1e3 * chosen.timestep:g} ms. Check gains, armature and masses of the model: a servo far too stiff "
+            "for its inertia, or a body without mass, is the usual cause."
+        )
+    return chosen, error
+
+
+def largest_step(log: Log, simulator: str = MUJOCO) -> Numerics:
+    """Fourth-order Runge-Kutta at the largest step that divides the sample period."""
+    return Numerics("RK4", _divisor(float(np.median(np.diff(log.time))), COARSEST), simulator=simulator)
+
+
+def converged(
+    chosen: Numerics, positions: Callable[[Numerics], dict[str, FloatArray]], log: Log
+) -> tuple[Numerics, float]:
+    """The largest step, beginning with one, that passes the check, and the change when it is halved.
+
+    Parameters
+    ----------
+    chosen : integrator and step to begin with.
+    positions : joint -> positions (n,) in the plain model under some numerics.
+    log : whose noise floors are the measure.
+
+    Returns
+    -------
+    Numerics, float
+        The finest step where none passes; the change is not finite where even that diverges.
+    """
+    now = positions(chosen)
     while True:
-        half = _positions(robot, part, chosen.halved(), threads)
-        error, finest = _change(part, now, half), chosen.timestep / 2 < FINEST
-        if error <= TOLERATED or (finest and np.isfinite(error)):
+        half = positions(chosen.halved())
+        error = _change(log, now, half)
+        if error <= TOLERATED or chosen.timestep / 2 < FINEST:
             return chosen, error
-        if finest:
-            raise ModelError(
-                f"model {robot.name}: the replay of {log.path or 'the log'} diverges even with a step of "
-                f"{1e3 * chosen.timestep:g} ms. Check gains, armature and masses of the model: a servo far too stiff "
-                "for its inertia, or a body without mass, is the usual cause."
-            )
         chosen, now = chosen.halved(), half
 
 

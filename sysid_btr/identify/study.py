@@ -8,7 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
@@ -136,6 +136,11 @@ class Study:
         """The study with the segments of fitted episodes half a segment later; held-out ones keep theirs."""
         return replace(self, train=tuple(episode.with_later_segments() for episode in self.train))
 
+    def with_share(self, share: float, model: Model) -> Study:
+        """The study with segments of a fraction of their length, which start where the data want them."""
+        shorter = replace(self, train=tuple(episode.with_share(share) for episode in self.train))
+        return self if shorter.train == self.train else shorter.with_initial_states(model, held_out=False)
+
     def with_initial_states(self, model: Model, *, held_out: bool = True, anew: bool = True) -> Study:
         """The study with the initial states of its segments where the data want them under a model.
 
@@ -248,7 +253,7 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
             measured.setdefault(joint, []).append(asked)
         torque.append(t)
         velocity.append(v)
-        acceleration.append(np.gradient(v, time, axis=0))
+        acceleration.append(_rate(v, time, episode.breaks - skip))
         span.append(np.nanmax(q, axis=0) - np.nanmin(q, axis=0))
     model = robot.model
     t, v, a = (np.concatenate(x) for x in (torque, velocity, acceleration))
@@ -272,6 +277,14 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
             measured_peak=float(np.max(np.abs(asked), initial=0.0)),
         )
     return scales
+
+
+def _rate(values: FloatArray, time: FloatArray, breaks: IntArray) -> FloatArray:
+    """Derivative (n, j) of a series that begins anew at some of its samples; NaN next to them."""
+    rate = np.gradient(values, time, axis=0)
+    inner = breaks[(breaks > 0) & (breaks < len(time))]
+    rate[inner], rate[inner - 1] = np.nan, np.nan
+    return rate
 
 
 def _torque_asked(robot: Robot, log: Log) -> dict[str, FloatArray]:

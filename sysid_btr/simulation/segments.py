@@ -1,8 +1,8 @@
 """Replay by segments: short stretches of a log, each from a state of its own, all in one batch (multiple shooting).
 
-A biped that is replayed from its first sample falls; a segment of a few tenths of a second from a known state does
-not. Segments times candidates are the simulations of a batch. The outputs are those of a whole log, each sample
-predicted by the segment it lies in, and NaN where there is none.
+A biped that is replayed from its first sample falls, and a pendulum driven by torques goes its own way; a segment of a
+few tenths of a second from a known state does not. Segments times candidates are the simulations of a batch. The
+outputs are those of a whole log, each sample predicted by the segment it lies in, and NaN where there is none.
 """
 
 from __future__ import annotations
@@ -10,22 +10,64 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.mujoco_conventions import free_joints, to_quaternion, to_rotation
 from sysid_btr.simulation.grid import Grid, step_inputs
-from sysid_btr.simulation.replay import Replay
+from sysid_btr.simulation.replay import CHUNK_DOFS, Replay
 from sysid_btr.simulation.setup import Setup, Values, prepare
+from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Fields, Outputs
 
+if TYPE_CHECKING:
+    from sysid_btr.io.log import Log
+
 SIMULATIONS = 96
-"""Simulations of one batch."""
+"""Simulations of one batch, at least."""
+WORTH = 0.8
+"""Length of a segment, as a fraction of the longest of a batch, from which it shares the batch."""
 LEAD = 0.25
-"""s of commands before a segment that reach into it when they are delayed, by a bus, whatever the robot's size."""
+"""s of commands before a segment that reach into it when they are delayed, by a bus, whatever the robot's size; more
+where a term can delay them longer."""
 BASE = 12
 """Numbers of a free base in a state: position, rotation, velocity, angular velocity, three each."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseStates:
+    """States of a free base.
+
+    Attributes
+    ----------
+    position, velocity : (w, 3) in the world, m and m/s.
+    quaternion : (w, 4), scalar first.
+    rate : (w, 3) angular velocity in the base's frame, rad/s.
+    """
+
+    position: FloatArray
+    quaternion: FloatArray
+    velocity: FloatArray
+    rate: FloatArray
+
+    def chosen(self, which: IntArray) -> BaseStates:
+        """Some of the states."""
+        return BaseStates(self.position[which], self.quaternion[which], self.velocity[which], self.rate[which])
+
+    def moved(self, change: FloatArray) -> BaseStates:
+        """Changed by small amounts, (w, 12), in position, rotation in the base's frame, velocity and rate."""
+        from scipy.spatial.transform import Rotation
+
+        turned = to_rotation(self.quaternion) * Rotation.from_rotvec(change[:, 3:6])
+        return BaseStates(
+            self.position + change[:, :3],
+            to_quaternion(turned),
+            self.velocity + change[:, 6:9],
+            self.rate + change[:, 9:12],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,60 +77,79 @@ class Segments:
     Attributes
     ----------
     rows : (w, 2) first sample of each segment, and the one after its last.
-    position, velocity : (w, 3) of the base in the world.
-    quaternion : (w, 4) of the base, scalar first.
-    rate : (w, 3) angular velocity in the base's frame.
     joint_position, joint_velocity : (w, j).
-    std : (w, 12 + 2 j) standard deviations of base position, rotation (in the base's frame), velocity, angular
-        velocity, joint positions and joint velocities.
+    std : (w, b + 2 j) standard deviations: of the base's position, rotation (in its frame), velocity and angular
+        velocity where it floats, b = 12, else b = 0; of joint positions and joint velocities.
+    base : of the base where it floats.
+    joint_acceleration : (w, j), by which a start between two borders is taken back to the first; None for none.
     """
 
     rows: IntArray
-    position: FloatArray
-    quaternion: FloatArray
-    velocity: FloatArray
-    rate: FloatArray
     joint_position: FloatArray
     joint_velocity: FloatArray
     std: FloatArray
+    base: BaseStates | None = None
+    joint_acceleration: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.rows)
 
+    @property
+    def base_numbers(self) -> int:
+        """Numbers of a state that are the base's; those of the joints follow."""
+        return 0 if self.base is None else BASE
+
+    @property
+    def free_base(self) -> BaseStates:
+        """States of the base, which floats."""
+        if self.base is None:
+            raise ValueError("segments of a fixed base")
+        return self.base
+
     def chosen(self, which: IntArray) -> Segments:
         """Some of the segments."""
-        return Segments(*(getattr(self, name)[which] for name in _FIELDS))
+        base = None if self.base is None else self.base.chosen(which)
+        rate = None if self.joint_acceleration is None else self.joint_acceleration[which]
+        return Segments(
+            self.rows[which], self.joint_position[which], self.joint_velocity[which], self.std[which], base, rate
+        )
 
     def shifted(self, rows: int) -> Segments:
         """The same segments in a log that begins so many samples later."""
         return replace(self, rows=self.rows - rows)
 
     def moved(self, change: FloatArray) -> Segments:
-        """Starts changed by small amounts in the coordinates of `std`, (w, 12 + 2 j)."""
-        from scipy.spatial.transform import Rotation
-
-        j = self.joint_position.shape[1]
-        turned = to_rotation(self.quaternion) * Rotation.from_rotvec(change[:, 3:6])
+        """Starts changed by small amounts in the coordinates of `std`, (w, b + 2 j)."""
+        b, j = self.base_numbers, self.joint_position.shape[1]
         return replace(
             self,
-            position=self.position + change[:, :3],
-            quaternion=to_quaternion(turned),
-            velocity=self.velocity + change[:, 6:9],
-            rate=self.rate + change[:, 9:12],
-            joint_position=self.joint_position + change[:, BASE : BASE + j],
-            joint_velocity=self.joint_velocity + change[:, BASE + j :],
+            joint_position=self.joint_position + change[:, b : b + j],
+            joint_velocity=self.joint_velocity + change[:, b + j :],
+            base=None if self.base is None else self.base.moved(change[:, :b]),
         )
 
+    def late(self, seconds: FloatArray) -> Segments:
+        """The same with starts that are so much earlier, (w,), on the same course."""
+        back, ago = np.zeros_like(self.std), -seconds[:, None]
+        b, j = self.base_numbers, self.joint_position.shape[1]
+        back[:, b : b + j] = ago * self.joint_velocity
+        if self.joint_acceleration is not None:
+            back[:, b : b + j] += 0.5 * ago**2 * self.joint_acceleration
+            back[:, b + j :] = ago * self.joint_acceleration
+        if self.base is not None:
+            back[:, :3], back[:, 3:6] = ago * self.base.velocity, ago * self.base.rate
+        return self.moved(back)
 
-def on_slope(starts: Segments, level: FloatArray, tilted: FloatArray) -> Segments:
-    """Starts on a floor to which gravity is not normal.
+
+def on_slope(base: BaseStates, level: FloatArray, tilted: FloatArray) -> BaseStates:
+    """A base on a floor to which gravity is not normal.
 
     The inertial unit knows the base's attitude to gravity, so where gravity is tilted in the floor's frame the base
     is tilted with it, about the ground below it.
 
     Parameters
     ----------
-    starts : on a level floor.
+    base : on a level floor.
     level : (3,) gravity normal to the floor.
     tilted : (w, 3) gravity of each start.
     """
@@ -99,17 +160,38 @@ def on_slope(starts: Segments, level: FloatArray, tilted: FloatArray) -> Segment
     axis, cosine = np.cross(a, b), np.clip(b @ a, -1.0, 1.0)
     sine = np.linalg.norm(axis, axis=1)
     turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.where(sine > 0, sine, 1.0))[:, None])
-    below = starts.position * [1.0, 1.0, 0.0]
-    turned = turn * to_rotation(starts.quaternion)
+    below = base.position * [1.0, 1.0, 0.0]
+    turned = turn * to_rotation(base.quaternion)
     return replace(
-        starts,
-        position=below + turn.apply(starts.position - below),
+        base,
+        position=below + turn.apply(base.position - below),
         quaternion=to_quaternion(turned),
-        velocity=turn.apply(starts.velocity),
+        velocity=turn.apply(base.velocity),
     )
 
 
-_FIELDS = ("rows", "position", "quaternion", "velocity", "rate", "joint_position", "joint_velocity", "std")
+def segment_seconds(segments: Segments, log: Log) -> float:
+    """Length of a segment, s; 0 where there is none."""
+    if len(segments) == 0:
+        return 0.0
+    a, b = segments.rows[0]
+    return float((log.time[b - 1] - log.time[a]) * (b - a) / max(b - a - 1, 1))
+
+
+def spread_evenly(segments: Segments, log: Log, seconds: float) -> IntArray:
+    """Which segments (k,) to take for no more than so many seconds of them, spread evenly over the log."""
+    if len(segments) == 0:
+        return np.arange(0)
+    count = int(np.clip(round(seconds / segment_seconds(segments, log)), 1, len(segments)))
+    return np.unique(np.linspace(0, len(segments) - 1, count).astype(np.int64))
+
+
+def covered(segments: Segments, samples: int) -> BoolArray:
+    """(n,) whether a sample of a log lies in a segment."""
+    result = np.zeros(samples, dtype=bool)
+    for a, b in segments.rows:
+        result[a:b] = True
+    return result
 
 
 @dataclass(frozen=True)
@@ -122,6 +204,16 @@ class _Frame:
     fraction: FloatArray
     late: float
     """s from the first border to the first sample."""
+
+    @property
+    def steps(self) -> int:
+        """Steps to its last sample."""
+        return max(int(self.after[-1]), 1)
+
+    @property
+    def size(self) -> int:
+        """The same for segments that are worth simulating to the longest one's end."""
+        return int(np.ceil(np.log(self.steps) / np.log(1 / WORTH)))
 
     @property
     def key(self) -> tuple[bytes, bytes, bytes]:
@@ -138,6 +230,12 @@ class SegmentReplay(Replay):
     """
 
     segments: Segments | None = None
+
+    @cached_property
+    def lead(self) -> float:
+        """How long before a segment commands may still reach into it, s: as long as any term can delay them."""
+        shaping = (t for t in self.all_terms if type(t).overrides("shape_command"))
+        return max([LEAD, *(p.upper for t in shaping for p in t.parameters if p.unit == "s")])
 
     @cached_property
     def _segments(self) -> Segments:
@@ -186,7 +284,7 @@ class SegmentReplay(Replay):
         Parameters
         ----------
         values : (p,) the candidate.
-        directions : (d, 12 + 2 j) or (w, d, 12 + 2 j) changes, in the coordinates of `Segments.std`.
+        directions : (d, b + 2 j) or (w, d, b + 2 j) changes, in the coordinates of `Segments.std`.
 
         Yields
         ------
@@ -220,57 +318,65 @@ class SegmentReplay(Replay):
     def _simulate(
         self, candidates: FloatArray, row: IntArray, segment: IntArray, change: FloatArray | None
     ) -> Iterator[tuple[IntArray, Outputs]]:
-        """Simulations (candidate, segment, change of its start), in batches of segments with the same sample times."""
+        """Simulations (candidate, segment, change of its start), in batches; parts have the same sample times."""
         pairs = self._values(candidates)
         # a torque known in advance is known on the log's clock, so its segments cannot share a batch
         alone = any(type(term).overrides("applied_torque") for term, _ in pairs)
-        groups: dict[object, list[int]] = {}
-        for i, w in enumerate(segment):
-            groups.setdefault(int(w) if alone else self._frames[w].key, []).append(i)
+        groups: dict[int, list[int]] = {}
+        for i in sorted(range(len(segment)), key=lambda i: self._clock[segment[i]]):
+            groups.setdefault(int(segment[i]) if alone else self._frames[segment[i]].size, []).append(i)
+        most = max(SIMULATIONS, CHUNK_DOFS // max(self.model.nv, 1))
         for members in groups.values():
-            for first in range(0, len(members), SIMULATIONS):
-                sims = np.array(members[first : first + SIMULATIONS])
-                yield (
-                    sims,
-                    self._block(
-                        [(term, values[row[sims]]) for term, values in pairs],
-                        segment[sims],
-                        None if change is None else change[sims],
-                    ),
-                )
+            for first in range(0, len(members), most):
+                sims = np.array(members[first : first + most])
+                own = [(term, values[row[sims]]) for term, values in pairs]
+                yield from self._block(own, sims, segment[sims], None if change is None else change[sims])
 
-    def _block(self, pairs: Values, segment: IntArray, change: FloatArray | None) -> Outputs:
-        """One batch of simulations that share their sample times."""
-        frame = self._frames[segment[0]]
-        h, steps = self.grid.timestep, max(int(frame.after[-1]), 1)
-        local = Grid(
-            timestep=h,
-            command=np.empty((steps, 0)),
-            sample_time=(frame.before + frame.fraction) * h,
-            state=np.arange(steps + 1),
-            before=frame.before,
-            after=frame.after,
-            fraction=frame.fraction,
-        )
-        return self._go(self._setup(pairs, segment, change, steps), pairs, local)
+    @cached_property
+    def _clock(self) -> list[int]:
+        """Of each segment, the first one with the same sample times."""
+        first: dict[object, int] = {}
+        return [first.setdefault(frame.key, w) for w, frame in enumerate(self._frames)]
+
+    def _block(
+        self, pairs: Values, sims: IntArray, segment: IntArray, change: FloatArray | None
+    ) -> Iterator[tuple[IntArray, Outputs]]:
+        """One batch of simulations, read where they share their sample times."""
+        h, steps = self.grid.timestep, max(self._frames[w].steps for w in segment)
+        setup = self._setup(pairs, segment, change, steps)
+        states = self.simulate(setup, np.arange(steps + 1))
+        clock = np.array([self._clock[w] for w in segment])
+        borders = np.flatnonzero(np.diff(clock, prepend=-1, append=-1))
+        for a, b in pairwise(borders):
+            frame, rows = self._frames[segment[a]], slice(int(a), int(b))
+            local = Grid(
+                timestep=h,
+                command=np.empty((frame.steps, 0)),
+                sample_time=(frame.before + frame.fraction) * h,
+                state=np.arange(frame.steps + 1),
+                before=frame.before,
+                after=frame.after,
+                fraction=frame.fraction,
+            )
+            own = states
+            if len(borders) > 2:
+                own = states.of(rows, local.state)
+                if frame.steps < steps:
+                    own.repeat_last_effort()
+            yield sims[rows], self.read(setup, rows, [(term, values[rows]) for term, values in pairs], own, local)
 
     def _setup(self, pairs: Values, segment: IntArray, change: FloatArray | None, steps: int) -> Setup:
         """Segments from their initial states, with `change` added to these."""
-        frame, h = self._frames[segment[0]], self.grid.timestep
+        h, frames = self.grid.timestep, [self._frames[w] for w in segment]
         starts = self._segments.chosen(segment)
         if change is not None:
             starts = starts.moved(change[:, : starts.std.shape[1]])
-        if frame.late:
-            late = np.zeros_like(starts.std)
-            joints = starts.joint_position.shape[1]
-            late[:, :3], late[:, 3:6] = -frame.late * starts.velocity, -frame.late * starts.rate
-            late[:, BASE : BASE + joints] = -frame.late * starts.joint_velocity
-            starts = starts.moved(late)
+        late = np.array([frame.late for frame in frames])
+        if late.any():
+            starts = starts.late(late)
         batch = self.batch(pairs, len(segment))
-        if "opt.gravity" in batch.fields:
-            starts = on_slope(starts, np.array(self.model.opt.gravity), batch.read("opt.gravity"))
-        first = np.array([self._frames[w].first for w in segment])
-        lead = round(LEAD / h)
+        first = np.array([frame.first for frame in frames])
+        lead = round(self.lead / h)
         rows = np.clip(first[:, None] + np.arange(-lead, steps), 0, self.grid.steps - 1)
         setup = prepare(
             batch,
@@ -285,11 +391,29 @@ class SegmentReplay(Replay):
             lead=lead,
             extra=self.grid.extra[rows],
         )
-        place, motion = self._free_joint
-        qpos, qvel = setup.state["qpos"], setup.state["qvel"]
-        qpos[:, place : place + 3], qpos[:, place + 3 : place + 7] = starts.position, starts.quaternion
-        qvel[:, motion : motion + 3], qvel[:, motion + 3 : motion + 6] = starts.velocity, starts.rate
+        if starts.base is not None:
+            base, (place, motion) = starts.base, self._free_joint
+            if "opt.gravity" in batch.fields:
+                base = on_slope(base, np.array(self.model.opt.gravity), batch.read("opt.gravity"))
+            qpos, qvel = setup.state["qpos"], setup.state["qvel"]
+            qpos[:, place : place + 3], qpos[:, place + 3 : place + 7] = base.position, base.quaternion
+            qvel[:, motion : motion + 3], qvel[:, motion + 3 : motion + 6] = base.velocity, base.rate
         return replace(setup, state={**setup.state, **self.push(segment, change)})
+
+    def lanes(self) -> list[list[tuple[int, IntArray]]]:
+        """Numbers of a start that one simulation can vary together: (position in `Segments.std`, joints it moves).
+
+        Of joints of different subtrees, one each.
+        """
+        where, joints = subtrees(self.model), self.index.joints
+        members: dict[int, list[int]] = {}
+        for j, name in enumerate(joints):
+            members.setdefault(where[name], []).append(j)
+        lanes = []
+        for k in range(max(map(len, members.values()))):
+            own = [(m[k], np.array(m)) for m in members.values() if k < len(m)]
+            lanes += [[(j, seen) for j, seen in own], [(len(joints) + j, seen) for j, seen in own]]
+        return lanes
 
     def push(self, segment: IntArray, change: FloatArray | None) -> Fields:
         """Forces from outside on a batch of segments, as in MjData; none here."""

@@ -102,6 +102,7 @@ class Tracks:
 
     position: FloatArray
     velocity: FloatArray
+    acceleration: FloatArray
     position_std: FloatArray
     velocity_std: FloatArray
 
@@ -153,4 +154,4 @@ def smooth_joints(time: FloatArray, measured: FloatArray, second: float = 1.0, *
     # an angle's derivative, in the robot's own s
     value = float(second**-derivative)
     mean, std = found.mean * value, deviation * value
-    return Tracks(mean[..., 0], mean[..., 1] / second, std[..., 0], std[..., 1] / second)
+    return Tracks(mean[..., 0], mean[..., 1] / second, mean[..., 2] / second**2, std[..., 0], std[..., 1] / second)

@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.floating_base.feet import touching_bodies, up_to_base
+from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.marginal import Marginal, projections, sensitivity
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.simulation.segments import BASE, SegmentReplay, Segments
+from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.simulation.silence import silenced
 
 
@@ -24,6 +23,8 @@ def update_initial_states(
     coarse: Numerics,
     *,
     anew: bool = True,
+    weigh: bool = False,
+    damped: bool = False,
 ) -> tuple[Segments, Marginal]:
     """Move the initial states of segments to where the data want them, and find what they leave open.
 
@@ -35,19 +36,23 @@ def update_initial_states(
     values : (p,) the candidate.
     coarse : integrator and step for derivatives with respect to the initial states.
     anew : whether derivatives that are known are taken again.
+    weigh : whether segments count by what is left in them.
+    damped : whether a step is taken only as far as it helps: long segments are not linear in their starts.
     """
     assert replay.segments is not None
     segments, marginal = replay.segments, before
     w, coordinates = segments.std.shape
     if anew or marginal is None:
-        marginal = respond(replace(replay, numerics=coarse), values)
+        # scores are of all channels, fitted or not
+        effort = replay.effort or any(replay.log.has("effort", j) for j in replay.index.joints)
+        marginal = respond(replace(replay, numerics=coarse, effort=effort), values)
         if before is not None:
             marginal = replace(marginal, shift=before.shift)
     # sigma of the noise itself: how well a segment is explained must not depend on what others leave
     plain = tuple(replace(t, sigma=t.noise) for t in targets)
     white = Comparison(replay, plain, marginal).raw(replay.predict(values[None]))[0]
     change = np.zeros((w, coordinates))
-    shift = marginal.shift.copy()
+    before_shift, shift = marginal.shift, marginal.shift.copy()
     if not np.isfinite(white).all():
         return segments, marginal
     for i in range(w):
@@ -58,10 +63,40 @@ def update_initial_states(
         best = np.clip(best, -FARTHEST, FARTHEST)
         change[i] = (best - shift[i]) * segments.std[i]
         shift[i] = best
+    if damped:
+        taken = _helpful(replay, plain, values, change, before_shift, shift)[:, None]
+        change, shift = taken * change, before_shift + taken * (shift - before_shift)
     segments, marginal = segments.moved(change), replace(marginal, shift=shift)
-    return segments, weighed(marginal, replace(replay, segments=segments), plain, values)
+    if weigh:
+        marginal = weighed(marginal, replace(replay, segments=segments), plain, values)
+    return segments, marginal
 
 
+def _helpful(
+    replay: SegmentReplay,
+    targets: tuple[Target, ...],
+    values: FloatArray,
+    change: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+) -> FloatArray:
+    """Fraction (w,) of a step of the starts, in `FRACTIONS`, after which data and prior are best together."""
+    fractions = np.array(FRACTIONS)
+    shifts = before[:, None] + fractions[:, None] * (after - before)[:, None]
+    cost = np.sum(shifts**2, axis=2)
+    rows = replay._segments.rows
+    with silenced():
+        for w, outputs in replay.respond(values, fractions[:, None] * change[:, None]):
+            a, b = rows[w]
+            for target in targets:
+                seen: FloatArray = getattr(outputs, target.channel)[:, :, target.columns]
+                left = (target.measured[a:b] - seen) / target.noise
+                cost[w] += np.sum(np.where(target.mask[a:b], left, 0.0) ** 2, axis=(1, 2))
+    return np.asarray(fractions[np.argmin(np.nan_to_num(cost, nan=np.inf), axis=1)])
+
+
+FRACTIONS = (0.0, 0.03, 0.1, 0.3, 1.0)
+"""Of a Gauss-Newton step of the starts that are tried."""
 USUAL, LEAST_WEIGHT = 0.3, 0.02
 """Quantile of the segments' chi2 up to which they count in full, and the least that a segment counts."""
 FARTHEST = 3.0
@@ -85,7 +120,7 @@ def respond(replay: SegmentReplay, values: FloatArray) -> Marginal:
     """Derivatives of all sensors with respect to the initial states of all segments."""
     segments = replay.segments
     assert segments is not None
-    lanes = start_lanes(replay)
+    lanes = replay.lanes()
     w, coordinates = segments.std.shape
     directions = np.zeros((w, len(lanes) + 1, coordinates))
     for k, lane in enumerate(lanes):
@@ -104,28 +139,3 @@ def respond(replay: SegmentReplay, values: FloatArray) -> Marginal:
                         table[coordinate][:, seen] = change[k][:, seen]
                 responses[i][channel] = table
     return Marginal(segments.rows, tuple(responses), np.ones(w), np.zeros((w, coordinates)))
-
-
-def start_lanes(replay: SegmentReplay) -> list[list[tuple[int, IntArray]]]:
-    """Coordinates of an initial state that one simulation can vary together: (coordinate, joints that it moves).
-
-    Limbs without a foot hang on the base; what happens in one of them hardly moves the others.
-    """
-    model, index = replay.model, replay.index
-    joints = len(index.joints)
-    everything = np.arange(joints)
-    feet = {model.body(f.name).id for f in touching_bodies(model)}
-
-    standing = {up_to_base(model, b)[-1] for b in feet}
-    own = [up_to_base(model, int(b))[-1] for b in index.body]
-    lanes = [[(c, everything)] for c in (2, 3, 4, *range(6, BASE))]
-    hanging: dict[int, list[int]] = {}
-    for j, b in enumerate(own):
-        if b in standing:
-            lanes += [[(BASE + j, everything)], [(BASE + joints + j, everything)]]
-        else:
-            hanging.setdefault(b, []).append(j)
-    for k in range(max((len(m) for m in hanging.values()), default=0)):
-        members = [(m[k], np.array(m)) for m in hanging.values() if k < len(m)]
-        lanes += [[(BASE + j, seen) for j, seen in members], [(BASE + joints + j, seen) for j, seen in members]]
-    return lanes

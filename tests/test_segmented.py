@@ -1,0 +1,189 @@
+"""Replay by segments where the base is fixed: robots that open loop does not hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+from toys import pendulum, robot_from_xml, swing
+
+from sysid_btr.errors import LogError, UsageError
+from sysid_btr.identify.episode import FixedEpisode
+from sysid_btr.identify.fit import Fit, fit
+from sysid_btr.identify.horizon import is_held
+from sysid_btr.identify.mode import Mode
+from sysid_btr.identify.segmented import SegmentedEpisode, follow, measured_motion
+from sysid_btr.identify.study import make_study
+from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.robot import Robot
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
+from sysid_btr.simulation.segments import SegmentReplay, Segments
+from sysid_btr.terms.servo import CommandDelay
+
+TWO = """<mujoco><worldbody>
+<body name="upper"><joint name="shoulder" axis="0 1 0" armature=".002" {dry}/>
+<inertial pos="0 0 -.2" mass="{upper}" diaginertia=".004 .004 .004"/>
+<body name="lower" pos="0 0 -.2"><joint name="elbow" axis="0 1 0" armature=".002" {dry}/>
+<inertial pos="0 0 -.2" mass=".5" diaginertia=".004 .004 .004"/></body></body></worldbody>
+<actuator><motor name="shoulder" joint="shoulder"/><motor name="elbow" joint="elbow"/></actuator></mujoco>"""
+JOINTS = ("shoulder", "elbow")
+FRICTION, MASS = 0.08, 0.55
+NOISE = 1e-3
+WILD, QUIET = 0.7, 0.25
+"""Nm, of torques that swing the arms round, and of such that do not."""
+
+
+def double_pendulum(dry: str = "", upper: float = 0.5) -> Robot:
+    """Two links that motors drive; as nominal without friction."""
+    return robot_from_xml(TWO.format(dry=dry, upper=upper), "double")
+
+
+@cache
+def driven(seed: int = 0, *, torque: float = WILD, seconds: float = 4.0, jitter: float = 0.0) -> Log:
+    """A log of the double pendulum with dry friction at both joints and a heavier link, by MuJoCo alone."""
+    rng = np.random.default_rng(seed)
+    # as stiff as the step allows: MuJoCo's own friction creeps
+    stiff = 'solreffriction="0.001 1" solimpfriction="0.99 0.999 0.001 0.5 2"'
+    spec = TWO.format(dry=f'frictionloss="{FRICTION}" {stiff}', upper=MASS)
+    model = mujoco.MjModel.from_xml_string(spec)
+    model.opt.timestep, model.opt.integrator = 0.0005, mujoco.mjtIntegrator.mjINT_RK4
+    data = mujoco.MjData(model)
+    ticks, n = 10, round(seconds / 0.005)
+    at = np.arange(n) * ticks + np.round(jitter * ticks * rng.uniform(size=n)).astype(int)
+    frequency, phase = rng.uniform(0.3, 1.5, size=(2, 3, 2)), rng.uniform(0, 6, size=(3, 2))
+    now = at * model.opt.timestep
+    command = torque / 3 * np.sin(2 * np.pi * frequency[0] * now[:, None, None] + phase).sum(axis=1)
+    position = np.empty((n, 2))
+    for k in range(n):
+        position[k] = data.qpos
+        data.ctrl[:] = command[k]
+        for _ in range(at[k + 1] - at[k] if k + 1 < n else 0):
+            mujoco.mj_step(model, data)
+    position += rng.normal(scale=NOISE, size=position.shape)
+    channels = {
+        f"{c}.{j}": x[:, i] for c, x in (("command", command), ("position", position)) for i, j in enumerate(JOINTS)
+    }
+    meta = LogMeta(robot="double", mount="fixed", source="simulated", extra={"drive": "torque"})
+    return Log(time=now, channels=channels, meta=meta, episode=np.zeros(n, dtype=np.int64))
+
+
+FREED = ["mass:*", "frictionloss:*"]
+TRUTH = (MASS / 0.5, 1.0, FRICTION, FRICTION)
+
+
+@cache
+def fitted(seed: int = 0) -> Fit:
+    return fit(make_study(double_pendulum(), [driven(seed)], numerics=Numerics("RK4", 0.0025), threads=1), FREED)
+
+
+def test_torques_that_swing_a_double_pendulum_round_ask_for_segments() -> None:
+    robot = double_pendulum()
+    study = make_study(robot, [driven()], threads=1)
+    assert all(isinstance(e, SegmentedEpisode) for e in (*study.train, *study.holdout))
+    followed = follow(robot, driven())
+    assert not followed.open_loop
+    assert 0.2 < followed.seconds < 4.0
+    facts = study.train[0].facts()
+    assert facts is not None
+    assert facts["mode"] == "segments"
+    assert "can be followed for" in facts["why"]
+
+
+def test_a_servo_takes_errors_back_so_that_the_log_is_replayed_whole() -> None:
+    robot = pendulum()
+    assert is_held(robot, swing())
+    assert not is_held(double_pendulum(), driven())
+    assert isinstance(make_study(robot, [swing()], threads=1).train[0], FixedEpisode)
+
+
+def test_friction_and_masses_are_found_from_a_start_without_friction() -> None:
+    """The frictionless pendulum goes its own way within seconds, and is survived."""
+    found = fitted()
+    for estimate, truth in zip(found.estimates, TRUTH, strict=True):
+        assert estimate.identifiable == "yes"
+        assert estimate.value == pytest.approx(truth, rel=0.05)
+        assert abs(estimate.value - truth) < 4 * estimate.std + 0.01 * truth
+    before, after = (s.holdout["position"] for s in (found.nominal, found.before))
+    assert np.isfinite(before.chi2)
+    assert after.rmse < 0.02 * before.rmse
+
+
+def test_sizes_at_the_joints_are_those_of_the_motion_that_was_measured() -> None:
+    study = make_study(double_pendulum(), [driven()], threads=1)
+    tracks = measured_motion(double_pendulum(), driven())
+    for i, joint in enumerate(JOINTS):
+        scale = study.scales[joint]
+        rms = float(np.sqrt(np.mean(tracks.velocity[:, i] ** 2)))
+        assert 0.5 < scale.velocity_rms / rms < 2.0
+        assert scale.acceleration_rms < 100 * scale.velocity_rms
+
+
+def test_where_open_loop_holds_segments_give_the_same_answer() -> None:
+    """Below the friction that holds it at its lower end, the pendulum forgets its start."""
+    robot = double_pendulum(dry=f'damping="{FRICTION}"')
+    log = driven(torque=QUIET, seconds=4.0)
+    whole, cut = (
+        fit(make_study(robot, [log], threads=1, mode=Mode(segments=s)), FREED).estimates for s in ("whole", "1.0")
+    )
+    for a, b in zip(whole, cut, strict=True):
+        assert abs(a.value - b.value) < 4 * np.hypot(a.std, b.std) + 0.01 * abs(a.value)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.4])
+def test_segments_from_the_states_of_a_whole_replay_give_that_replay(jitter: float) -> None:
+    """Commands from long before a segment reach into it, and clocks that jitter share a batch."""
+    robot, log = double_pendulum(dry='damping=".05"'), driven(jitter=jitter, seconds=2.0, torque=QUIET)
+    late = CommandDelay(("shoulder",))
+    late = replace(late, known=tuple(replace(p, upper=0.6) for p in late.parameters))
+    numerics = Numerics("RK4", 0.0025)
+    values = np.array([[0.4], [0.113]])
+    whole = Replay(robot, log, (late,), numerics).predict(values)
+    rows = np.array([[120, 220], [220, 321], [321, 399]])
+    for k, value in enumerate(values):
+        first = rows[:, 0]
+        rate = np.gradient(whole.velocity[k], log.time, axis=0)[first]
+        starts = Segments(rows, whole.position[k, first], whole.velocity[k, first], np.ones((3, 4)), None, rate)
+        segments = SegmentReplay(robot, log, (late,), numerics, segments=starts).predict(values)
+        np.testing.assert_allclose(segments.position[k, 120:399], whole.position[k, 120:399], atol=2e-4)
+        alone = SegmentReplay(robot, log, (late,), numerics, segments=starts.chosen(np.array([1]))).predict(value[None])
+        assert np.array_equal(alone.position[0, 220:321], segments.position[k, 220:321])
+
+
+def test_segments_tile_what_is_fitted_and_what_is_held_out() -> None:
+    log = driven()
+    fitted_part, held = SegmentedEpisode.split(double_pendulum(), log, 0.3, seconds=0.4)
+    rows = np.concatenate([fitted_part.segments.rows, held.segments.rows])
+    assert rows[0, 0] == 0
+    assert rows[-1, 1] == len(log)
+    assert np.array_equal(rows[1:, 0], rows[:-1, 1])
+    assert np.array_equal(fitted_part.compared, fitted_part.scored[: len(fitted_part.log)])
+    assert not (fitted_part.scored & held.scored).any()
+
+
+def test_a_joint_that_is_not_logged_starts_where_the_model_has_it() -> None:
+    log = driven()
+    channels = {n: x for n, x in log.channels.items() if n != "position.elbow"}
+    tracks = measured_motion(double_pendulum(), replace(log, channels=channels))
+    assert not tracks.position[:, 1].any()
+    assert not tracks.position_std[:, 1].any()
+    none = {n: x for n, x in log.channels.items() if not n.startswith("position.")}
+    with pytest.raises(LogError, match="measured positions"):
+        measured_motion(double_pendulum(), replace(log, channels=none))
+
+
+@pytest.mark.parametrize(
+    ("name", "segments", "words"),
+    [
+        ("auto", "0", "a length in s"),
+        ("auto", "some", "a length in s"),
+        ("inverse", "0.5", "does not go with"),
+        ("segments", "whole", "does not go with"),
+    ],
+)
+def test_what_segments_can_be(name: str, segments: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        Mode(name, segments)
