@@ -289,6 +289,13 @@ def test_what_nothing_commands_is_listed() -> None:
     assert found(robot, log, "note")["actuator.idle"].where == "grip"
 
 
+def test_ctrl_of_a_gripper_is_neither_degrees_nor_a_joint_that_is_missing(tmp_path: Path) -> None:
+    log = moving(commands(command__grip=120 + 100 * WAVE))
+    write_log(log, tmp_path / "log.parquet")
+    read = read_log(tmp_path / "log.parquet")
+    assert [p for p in check_log(robot_from_xml(ARM.format(more=GRIPPER)), read) if p.severity != "note"] == []
+
+
 def test_torques_are_neither_degrees_nor_late_nor_dead() -> None:
     """15 Nm at a joint of 3 rad, 0 Nm at the other, which swings."""
     log = moving(commands(command__shoulder=15 * np.sin(9 * TIME), command__elbow=0 * TIME))

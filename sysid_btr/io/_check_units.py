@@ -227,6 +227,9 @@ def _degrees_by_magnitude(
             beside = log.channels.get(f"position.{joint}") if channel == "command" else None
             if beside is not None and 0 < _peak(beside) <= limit:
                 continue
+            # what has no position among others that have one is no joint's, unless the model says so: ctrl of a gripper
+            if channel == "command" and beside is None and joint not in ranges and log.joints("position"):
+                continue
             if peak > limit and (joint not in ranges or peak / DEGREES <= limit):
                 found[column] = f"{column} reaches {peak:.4g}, and {known}"
     for axis in ("angle_x", "angle_y"):
