@@ -29,6 +29,10 @@ def plain(toy: ToyProblem, x: FloatArray) -> Likelihood:
     return make_likelihood(toy, x, residual, jacobian, None)
 
 
+# fewer moves between replays than a robot is worth: a toy's replay is no dearer, and its draws are as independent
+SUBSTEPS = 10
+
+
 def draw(
     toy: ToyProblem,
     likelihood: Likelihood | None = None,
@@ -38,13 +42,14 @@ def draw(
     budget: Budget | None = None,
     journal: Journal | None = None,
     problem: object = None,
+    substeps: int = SUBSTEPS,
     **settings: object,
 ) -> Sample:
     return sample(
         toy if problem is None else problem,  # type: ignore[arg-type]
         plain(toy, toy.optimum) if likelihood is None else likelihood,
         priors or [Uniform()] * len(toy.names),
-        settings=Settings(**settings),  # type: ignore[arg-type]
+        settings=Settings(substeps=substeps, **settings),  # type: ignore[arg-type]
         rng=np.random.default_rng(seed),
         budget=budget or Budget(),
         journal=Journal() if journal is None else journal,
@@ -210,7 +215,7 @@ def test_ranks_of_the_truth_are_uniform() -> None:
     rng = np.random.default_rng(0)
     t, noise = np.linspace(0.0, 2.0, 12), 0.15
     lower, upper = np.array([0.5, 0.2]), np.array([3.0, 4.0])
-    quick = Settings(fewest_steps=12, autocorrelation_times=1.0, draws=50.0, rhat=1.5, substeps=20)
+    quick = Settings(fewest_steps=12, autocorrelation_times=1.0, draws=50.0, rhat=1.5, substeps=SUBSTEPS)
 
     def decay(x: FloatArray) -> FloatArray:
         return np.asarray(x[:, :1] * np.exp(-x[:, 1:] * t))
@@ -369,7 +374,7 @@ def test_settings_that_cannot_be_used(settings: dict[str, int], said: str) -> No
 @pytest.mark.parametrize("fraction", [0.2, 0.5, 0.8])
 def test_killed_and_resumed_it_gives_the_same_draws(fraction: float, tmp_path: Path) -> None:
     toy, _ = linear_gaussian(np.random.default_rng(0), p=2)
-    quick: dict[str, object] = {"draws": 200.0, "fewest_steps": 20, "substeps": 10}
+    quick: dict[str, object] = {"draws": 200.0, "fewest_steps": 20}
     reference = Witness(toy)
     whole = draw(toy, problem=reference, **quick)
     path = tmp_path / "j"
