@@ -16,13 +16,13 @@ from sysid_btr.floating_base.segments import FloatingReplay
 from sysid_btr.floating_base.size import NAO
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.study import Study, make_study
-from sysid_btr.io.log import Log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.segments import BASE, BaseStates, Segments
 
+OnSprings = tuple[ground.Walker, Study, ReplayProblem, np.ndarray]
 MASSES = ["mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"]
 
 
@@ -128,20 +128,19 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
 
 
 @pytest.fixture(scope="module")
-def on_springs() -> tuple[ground.Walker, Log]:
-    """A walk over springs and dampers, with masses far from the model's."""
+def on_springs() -> OnSprings:
+    """A walk over springs and dampers, with masses far from the model's, and the problem that it poses."""
     walker = ground.draw(5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ground, "SECONDS", 7.0)
+        patch.setattr(ground, "SECONDS", 5.5)
         log = ground.record(walker)
     assert log is not None
-    return walker, log
-
-
-def test_masses_come_out_whatever_the_ground_is(on_springs: tuple[ground.Walker, Log]) -> None:
-    walker, log = on_springs
     study = make_study(load_robot("nao"), [log])
-    problem, begin = problem_of(study)
+    return walker, study, *problem_of(study)
+
+
+def test_masses_come_out_whatever_the_ground_is(on_springs: OnSprings) -> None:
+    walker, study, problem, begin = on_springs
     found = without_ground(problem, begin)
     assert found is not None
     truth = {f"mass:{name}": factor for name, factor in walker.masses.items()}
@@ -176,15 +175,13 @@ def test_masses_come_out_whatever_the_ground_is(on_springs: tuple[ground.Walker,
 
 
 def test_a_model_that_lacks_something_else_is_contradicted() -> None:
-    log, _ = record_walk(Gait(), 6.0, delay=0.04, seed=2)
+    log, _ = record_walk(Gait(), 4.0, delay=0.04, seed=2)
     problem, begin = problem_of(make_study(load_robot("nao"), [log]))
     assert without_ground(problem, begin) is None
 
 
-def test_logs_that_do_not_suit_are_left_alone(on_springs: tuple[ground.Walker, Log]) -> None:
-    _, log = on_springs
-    problem, _ = problem_of(make_study(load_robot("nao"), [log]))
-    replay = problem.episodes[0].replay
+def test_logs_that_do_not_suit_are_left_alone(on_springs: OnSprings) -> None:
+    replay = on_springs[2].episodes[0].replay
     assert isinstance(replay, FloatingReplay)
     assert contact_free._suits(replay)
     time = replay.log.time.copy()

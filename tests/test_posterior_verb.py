@@ -17,7 +17,8 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators import Budget
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.study import make_study
-from sysid_btr.io.parquet import read_log
+from sysid_btr.io.log import Log
+from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.optional import optional
 from sysid_btr.posterior.draw import posterior
@@ -27,7 +28,7 @@ from sysid_btr.result import read_result
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 LEG_FIT = ("mass:HipPitch,KneePitch,HipRoll", "kp:*=shared")
-QUICK = Settings(draws=400.0, fewest_steps=25)
+QUICK = Settings(draws=400.0, fewest_steps=25, substeps=10)
 
 
 @pytest.fixture(scope="module")
@@ -87,11 +88,14 @@ def test_held_out_data_lie_in_their_bands(leg: Posterior) -> None:
         assert not band.held_out[: len(band.time) // 2].any()
 
 
+def short_log() -> Log:
+    """Half of a sample log: draws cost as many replays, of half the length."""
+    return read_log(SAMPLES / "pendulum_clean.parquet").window(0, 500)
+
+
 @pytest.fixture(scope="module")
 def pendulum() -> Fit:
-    study = make_study(
-        load_robot(str(SAMPLES / "pendulum.xml")), [read_log(SAMPLES / "pendulum_clean.parquet")], threads=1
-    )
+    study = make_study(load_robot(str(SAMPLES / "pendulum.xml")), [short_log()], threads=1)
     return fit(study, ("mass:*", "kp:*"))
 
 
@@ -109,7 +113,7 @@ def test_the_robots_table_is_asked_for_priors(pendulum: Fit) -> None:
     sure = replace(pendulum.study.robot, priors={"mass": f"normal({squares.value}, {0.1 * squares.std})"})
     told = posterior(
         replace(pendulum, study=replace(pendulum.study, robot=sure)),
-        settings=Settings(draws=200.0, fewest_steps=15),
+        settings=Settings(draws=200.0, fewest_steps=15, substeps=10),
         rng=np.random.default_rng(0),
     )
     assert told.estimates[0].std == pytest.approx(0.1 * squares.std, rel=0.25)
@@ -157,17 +161,26 @@ def test_the_posterior_of_a_single_parameter_is_drawn_with_the_fit() -> None:
 # --- the command line -------------------------------------------------------------------------------------
 
 
-ASKED = (
-    *("--model", str(SAMPLES / "pendulum.xml"), "--log", str(SAMPLES / "pendulum_clean.parquet")),
-    *("--fit", "mass:*", "--fit", "kp:*", "--threads", "1", "--priors", "kp=normal(1, 0.5)"),
-)
+@pytest.fixture(scope="module")
+def log_file(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("log") / "short.parquet"
+    write_log(short_log(), path)
+    return str(path)
 
 
-def test_the_verb_writes_everything_and_resumes(cli: Cli, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def asked(log_file: str) -> tuple[str, ...]:
+    return (
+        *("--model", str(SAMPLES / "pendulum.xml"), "--log", log_file),
+        *("--fit", "mass:*", "--fit", "kp:*", "--threads", "1", "--priors", "kp=normal(1, 0.5)"),
+    )
+
+
+def test_the_verb_writes_everything_and_resumes(cli: Cli, asked: tuple[str, ...], tmp_path: Path) -> None:
     import xarray
 
     out = tmp_path / "o"
-    answer = cli("posterior", *ASKED, "--out", out)
+    answer = cli("posterior", *asked, "--out", out)
     assert answer.code == 0, answer.err
     files = {"result.json", "posterior.nc", "corner.png", "trace.png", "predictive.png", "report.html", "journal.jsonl"}
     assert files <= {f.name for f in out.iterdir()}
@@ -196,17 +209,17 @@ def test_the_verb_writes_everything_and_resumes(cli: Cli, tmp_path: Path) -> Non
     (again / journal.name).write_bytes(b"".join(lines[: len(lines) // 2]))
     for array in out.glob("journal.jsonl.*.npy"):
         (again / array.name).write_bytes(array.read_bytes())
-    resumed = cli("posterior", *ASKED, "--out", again, "--resume", "--json")
+    resumed = cli("posterior", *asked, "--out", again, "--resume", "--json")
     assert resumed.code == 0, resumed.err
     assert json.loads(resumed.out)["parameters"] == result["parameters"]
-    other = cli("posterior", *ASKED, "--out", out, "--resume", "--ensembles", "3")
+    other = cli("posterior", *asked, "--out", out, "--resume", "--ensembles", "3")
     assert other.code == 2
     assert "another fit" in other.err
 
 
-def test_a_budget_that_is_out_is_written_and_exits_5(cli: Cli, tmp_path: Path) -> None:
+def test_a_budget_that_is_out_is_written_and_exits_5(cli: Cli, asked: tuple[str, ...], tmp_path: Path) -> None:
     out = tmp_path / "o"
-    answer = cli("posterior", *ASKED, "--out", out, "--max-evaluations", "150")
+    answer = cli("posterior", *asked, "--out", out, "--max-evaluations", "150")
     assert answer.code == 5
     result = read_result(out)
     assert result["converged"] is False
@@ -216,8 +229,8 @@ def test_a_budget_that_is_out_is_written_and_exits_5(cli: Cli, tmp_path: Path) -
     assert "did not converge" in answer.out
 
 
-def test_a_budget_too_small_for_one_draw_exits_5(cli: Cli) -> None:
-    answer = cli("posterior", *ASKED, "--max-evaluations", "20")
+def test_a_budget_too_small_for_one_draw_exits_5(cli: Cli, asked: tuple[str, ...]) -> None:
+    answer = cli("posterior", *asked, "--max-evaluations", "20")
     assert answer.code == 5
     assert "replays a step" in answer.err
 
@@ -233,20 +246,22 @@ def test_a_budget_too_small_for_one_draw_exits_5(cli: Cli) -> None:
     ],
     ids=" ".join,
 )
-def test_mistakes_are_told_before_the_work(cli: Cli, argv: tuple[str, ...], said: str) -> None:
-    answer = cli("posterior", *ASKED, *argv)
+def test_mistakes_are_told_before_the_work(cli: Cli, asked: tuple[str, ...], argv: tuple[str, ...], said: str) -> None:
+    answer = cli("posterior", *asked, *argv)
     assert answer.code == 2
     assert said in answer.err
 
 
-def test_a_missing_package_is_named_with_its_extra(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_package_is_named_with_its_extra(
+    cli: Cli, asked: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def missing(name: str) -> Any:
         if name == "corner":
             raise ModuleNotFoundError("No module named 'corner'", name="corner")
         return import_module(name)
 
     monkeypatch.setattr("sysid_btr.optional.import_module", missing)
-    answer = cli("posterior", *ASKED, "--out", tmp_path / "o")
+    answer = cli("posterior", *asked, "--out", tmp_path / "o")
     assert answer.code == 2
     assert "sysid-btr[posterior]" in answer.err
     assert not (tmp_path / "o").exists()
@@ -264,12 +279,12 @@ def test_only_the_missing_package_itself_is_blamed(monkeypatch: pytest.MonkeyPat
         optional("nowhere_at_all", "posterior", "this")
 
 
-def test_priors_and_settings_from_a_study_file(cli: Cli, tmp_path: Path) -> None:
+def test_priors_and_settings_from_a_study_file(cli: Cli, log_file: str, tmp_path: Path) -> None:
     study = tmp_path / "study.toml"
     study.write_text(
         f"""
         model = "{SAMPLES / "pendulum.xml"}"
-        log = "{SAMPLES / "pendulum_clean.parquet"}"
+        log = "{log_file}"
         fit = ["mass:*", "kp:*"]
         threads = 1
         json = true
@@ -288,17 +303,17 @@ def test_priors_and_settings_from_a_study_file(cli: Cli, tmp_path: Path) -> None
     assert (result["sampling"]["ensembles"], result["sampling"]["walkers"]) == (3, 10)
 
 
-def test_profiles_of_a_fit(cli: Cli, tmp_path: Path) -> None:
+def test_profiles_of_a_fit(cli: Cli, asked: tuple[str, ...], tmp_path: Path) -> None:
     out = tmp_path / "o"
-    asked = ASKED[: ASKED.index("--priors")]
-    answer = cli("fit", *asked, "--profile", "mass:*", "--out", out)
+    fitted = asked[: asked.index("--priors")]
+    answer = cli("fit", *fitted, "--profile", "mass:*", "--out", out)
     assert answer.code == 0, answer.err
     assert (out / "profile_mass_arm.png").read_bytes().startswith(b"\x89PNG")
     [entry] = read_result(out)["profiles"]
     assert entry["name"] == "mass:arm"
     assert entry["ci95"][0] < 1.1 < entry["ci95"][1]
     assert entry["closed"] == [True, True]
-    wrong = cli("fit", *asked, "--profile", "mas:arm")
+    wrong = cli("fit", *fitted, "--profile", "mas:arm")
     assert wrong.code == 2
     assert "mass:arm" in wrong.err
 
