@@ -174,11 +174,15 @@ class SegmentedEpisode(Episode):
         return found
 
     def choose_numerics(self, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
-        """As for a whole replay, judged over segments."""
+        """As for a whole replay, judged over segments as short as those of first fits.
+
+        What a step does wrong grows along long ones as every other error does, which a fit answers for (`step_check`).
+        """
         if self.log.meta.servo_period:
             return choose_numerics(self.robot, self.log, threads, simulator)
-        which = np.unique(np.linspace(0, len(self.segments) - 1, CHECKED).astype(np.int64))
-        few = replace(self, segments=self.segments.chosen(which))
+        short = self.with_share(SHARES[0])
+        which = np.unique(np.linspace(0, len(short.segments) - 1, CHECKED).astype(np.int64))
+        few = replace(short, segments=short.segments.chosen(which))
         inside = covered(few.segments, len(self.log))
 
         def positions(numerics: Numerics) -> dict[str, FloatArray]:
@@ -190,7 +194,7 @@ class SegmentedEpisode(Episode):
         chosen, error = converged(largest_step(self.log, simulator), positions, self.log)
         if not np.isfinite(error):
             raise ModelError(
-                f"model {self.robot.name}: segments of {segment_seconds(self.segments, self.log):.3g} s of "
+                f"model {self.robot.name}: segments of {segment_seconds(few.segments, self.log):.3g} s of "
                 f"{self.log.path or 'the log'} diverge even with a step of {1e3 * chosen.timestep:g} ms. Check "
                 "armature and masses of the model: a body without mass is the usual cause."
             )

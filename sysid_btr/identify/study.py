@@ -14,11 +14,12 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
 from sysid_btr.identify.mode import AUTOMATIC, Mode, episode_of, split_episode
+from sysid_btr.identify.segmented import measured_motion
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import split_episodes
 from sysid_btr.models.commands import commanded
 from sysid_btr.models.log_checks import require_drives
-from sysid_btr.models.robot import Robot
+from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP
@@ -26,7 +27,7 @@ from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.registry import on_simulator
 from sysid_btr.simulation.servo import ServoLaw
-from sysid_btr.terms.base import BatchModel, Term
+from sysid_btr.terms.base import BatchModel, Outputs, Term
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Model, Terms, as_model
 from sysid_btr.terms.scales import JointScale, Scales
@@ -245,6 +246,8 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
     for episode in episodes:
         log, replay = episode.log, episode.replay((), numerics, effort=True, threads=threads)
         outputs = replay.predict(np.zeros((1, 0)))
+        if not np.isfinite(outputs.position).any() and any(log.has("position", j) for j in replay.index.joints):
+            outputs = _as_measured(robot.for_log(log), log, outputs)
         joints = replay.index.joints
         skip = np.searchsorted(outputs.time, min(WARM_UP, 0.1 * outputs.time[-1]))
         t, v, q = episode.torque_at_hand(outputs)[skip:], outputs.velocity[0, skip:], outputs.position[0, skip:]
@@ -277,6 +280,16 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
             measured_peak=float(np.max(np.abs(asked), initial=0.0)),
         )
     return scales
+
+
+def _as_measured(robot: Robot, log: Log, outputs: Outputs) -> Outputs:
+    """What sensors show of the measured motion, where the plain model diverges; joints that are not logged rest."""
+    tracks, asked = measured_motion(robot, log), _torque_asked(robot, log)
+    effort = np.zeros(tracks.position.shape)
+    for i, joint in enumerate(joint_names(robot)):
+        if joint in asked and len(asked[joint]) == len(log):
+            effort[:, i] = asked[joint]
+    return replace(outputs, position=tracks.position[None], velocity=tracks.velocity[None], effort=effort[None])
 
 
 def _rate(values: FloatArray, time: FloatArray, breaks: IntArray) -> FloatArray:
