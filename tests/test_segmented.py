@@ -109,7 +109,7 @@ def test_friction_and_masses_are_found_from_a_start_without_friction() -> None:
         assert abs(estimate.value - truth) < 4 * estimate.std + 0.01 * truth
     before, after = (s.holdout["position"] for s in (found.nominal, found.before))
     assert np.isfinite(before.chi2)
-    assert after.rmse < 0.02 * before.rmse
+    assert after.rmse < 0.05 * before.rmse
 
 
 def test_sizes_at_the_joints_are_those_of_the_motion_that_was_measured() -> None:
