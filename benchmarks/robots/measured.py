@@ -262,7 +262,7 @@ def _effects(result: Mapping[str, Any]) -> dict[tuple[str, str], _Found]:
 def _shifted(found: _Found | None, by: float) -> _Found:
     if found is None or found[0] is None:
         return (by or None), None
-    value, interval = found
+    value, interval = found[0], found[1]
     return value + by, None if interval is None else (interval[0] + by, interval[1] + by)
 
 

@@ -119,7 +119,7 @@ def _rigid(
     axes = np.eye(3)
     turned = [np.concatenate([[np.cos(np.pi / 8)], np.sin(np.pi / 8) * axis]) for axis in axes]
     # mass, centre of mass, inertia about it, turn of its axes
-    bodies = [(1.0, np.zeros(3), np.zeros(3), None)]
+    bodies: list[tuple[float, FloatArray, FloatArray, FloatArray | None]] = [(1.0, np.zeros(3), np.zeros(3), None)]
     bodies += [(1.0, axis, np.zeros(3), None) for axis in axes]
     bodies += [(0.0, np.zeros(3), axis, None) for axis in axes]
     bodies += [(0.0, np.zeros(3), axes[(k + 1) % 3], turned[k]) for k in range(3)]
