@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,18 @@ from benchmarks.robots.suite import Case, cases
 from sysid_btr.diagnosis.close import close
 from sysid_btr.identify.inverse import InverseEpisode
 from sysid_btr.identify.study import make_study
+from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot, robot_from_file
 
 SUITE = {case.name: case for case in cases()}
+
+
+@functools.cache
+def short(name: str) -> tuple[Case, Log]:
+    """A case of the suite with six seconds of its log."""
+    case = SUITE[name]
+    case = replace(case, experiment=replace(case.experiment, seconds=6.0))
+    return case, case.log()
 
 
 def nominal(case: Case, folder: Path) -> Robot:
@@ -30,9 +40,8 @@ def nominal(case: Case, folder: Path) -> Robot:
 @pytest.mark.parametrize("name", ["no_command", "impedance_leg", "torque_sensor"])
 def test_another_drive_comes_to_the_right_answer(name: str, tmp_path: Path) -> None:
     """Friction without a command, a rotor behind kp, kd and tau, a torque sensor's offset; few rivals, short logs."""
-    case = SUITE[name]
-    case = replace(case, experiment=replace(case.experiment, seconds=6.0))
-    study = make_study(nominal(case, tmp_path), [case.log()], threads=1)
+    case, log = short(name)
+    study = make_study(nominal(case, tmp_path), [log], threads=1)
     rivals = ("coulomb_friction", "viscous_damping", "armature", "command_delay", "torque_offset", "encoder_offset")
     found = close(study, ["mass:*"], effects=rivals)
     answer = judge(found.to_dict(), case.planted, case.alike)
@@ -42,8 +51,7 @@ def test_another_drive_comes_to_the_right_answer(name: str, tmp_path: Path) -> N
 def test_the_suite_has_what_it_says() -> None:
     assert len(SUITE) >= 12
     assert sum(not case.planted for case in SUITE.values()) >= 2
-    short = replace(SUITE["cart_pole"].experiment, seconds=1.0)
-    case = replace(SUITE["cart_pole"], experiment=short)
+    case = replace(SUITE["cart_pole"], experiment=replace(SUITE["cart_pole"].experiment, seconds=0.4))
     first, again = case.log(), case.log()
     assert first.content == again.content
     assert set(first.channels) == {"command.rail", "position.rail", "position.pivot"}
@@ -90,9 +98,7 @@ def test_what_counts_as_right(
 
 
 def test_the_regression_knows_friction_and_predicts_to_the_noise(tmp_path: Path) -> None:
-    case = SUITE["no_command"]
-    case = replace(case, experiment=replace(case.experiment, seconds=6.0))
-    log = case.log()
+    case, log = short("no_command")
     fitted, held = InverseEpisode.split(nominal(case, tmp_path), log, 0.3)
     found = regress(fitted, held)
     for joint in ("shoulder", "elbow"):
