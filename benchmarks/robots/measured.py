@@ -135,7 +135,7 @@ def _dfki(name: str) -> Callable[[Path, Path, float], dict[str, Any]]:
         figures.append(Figure("effects that imitate", float(len(others)), reached=done.came_to_a_result and not others))
         if done.came_to_a_result:
             for other, hand in DFKI_OPEN_LOOP.items():
-                error = _open_loop(model, folder / "logs" / f"{other}.parquet", out / "out_params", out)
+                error = _open_loop(model, folder / "logs" / f"{other}.parquet", out / "open_loop", out)
                 reached = error is not None and error <= hand
                 figures.append(Figure(f"open loop {other}, rad", error, None, None, hand, None, reached))
         return _row(done, [*figures, _time(done, 60)])
@@ -146,7 +146,7 @@ def _dfki(name: str) -> Callable[[Path, Path, float], dict[str, Any]]:
 def _open_loop(model: Path, log: Path, work: Path, params: Path) -> float | None:
     """Position rmse of a replay of the whole log under the result of a run, rad."""
     replayed = run(
-        ("replay", "--model", str(model), "--log", str(log), "--params", str(params)), work / log.stem, 300.0
+        ("replay", "--model", str(model), "--log", str(log), "--params", str(params), "--json"), work / log.stem, 300.0
     )
     if not replayed.came_to_a_result:
         return None

@@ -25,7 +25,7 @@ class Run:
     Attributes
     ----------
     code : exit code; None where the time was up.
-    result : content of result.json, or empty.
+    result : content of result.json, or what `--json` printed, or empty.
     said : the end of its messages.
     seconds, cpu : wall and processor time.
     """
@@ -48,13 +48,14 @@ def run(arguments: Sequence[str], out: Path, limit: float) -> Run:
     began, cpu = perf_counter(), _cpu()
     try:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=limit)
-        code, said = done.returncode, done.stderr
+        code, said, printed = done.returncode, done.stderr, done.stdout
     except subprocess.TimeoutExpired as late:
-        code, said = None, _text(late.stderr)
+        code, said, printed = None, _text(late.stderr), ""
     seconds = perf_counter() - began
     written = out / "result.json"
     # an earlier result is not this run's
-    result = json.loads(written.read_text()) if code in FINISHED and written.is_file() else {}
+    text = written.read_text() if written.is_file() else printed if "--json" in arguments else "{}"
+    result = json.loads(text) if code in FINISHED else {}
     lines = [line.strip() for line in said.replace("\r", "\n").splitlines() if line.strip()]
     return Run(code, result, " ".join(lines[-4:])[-600:], seconds, _cpu() - cpu)
 
