@@ -12,6 +12,7 @@ import pytest
 from toys import make_log, robot_from_xml
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.close import close
 from sysid_btr.errors import ModelError
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.mode import Mode
@@ -489,6 +490,21 @@ def test_a_mass_is_recovered_through_any_drive(drive: str) -> None:
     (mass,) = found.estimates
     assert mass.std < 0.03
     assert mass.value == pytest.approx(1.2, abs=3 * mass.std)
+
+
+def test_friction_of_a_joint_that_nothing_drives_is_found() -> None:
+    """A shoulder swings the elbow, which has no drive: its sizes are those of what its motion takes."""
+    alone = ACTUATORS["position"].format(j="shoulder")
+    robot = robot_from_xml(ARM.format(more=f"<actuator>{alone}</actuator>"))
+    log = commands(command__shoulder=2 * WAVE)
+    study = make_study(robot, [recorded(robot, log, {"coulomb_friction:elbow": 0.03})], numerics=NUMERICS)
+    assert 0.01 < study.scales["elbow"].torque_rms < 1.0
+    found = close(study, ["mass:lower"], effects=("coulomb_friction", "joint_spring", "payload"))
+    assert [(e.effect, e.where) for e in found.effects] == [("coulomb_friction", ("elbow",))], found.message
+    (torque,) = found.effects[0].parameters
+    # a swing that nothing holds forgets the error of its start slowly
+    assert torque.ci95[0] < 0.03 < torque.ci95[1]
+    assert torque.std < 0.005
 
 
 def test_the_torque_that_drives_is_not_compared_with_itself() -> None:

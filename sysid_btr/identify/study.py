@@ -240,7 +240,11 @@ def _refuse_repeats(recordings: Iterable[Log]) -> None:
 
 
 def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics, threads: int = 0) -> Scales:
-    """Sizes at every joint, from replays of the plain model."""
+    """Sizes at every joint, from replays of the plain model.
+
+    Of a joint without a drive of its own (passive, coupled, pulled by a tendon) torques are those that its own motion
+    takes of its inertia.
+    """
     torque, velocity, acceleration, span = [], [], [], []
     measured: dict[str, list[FloatArray]] = {}
     for episode in episodes:
@@ -254,9 +258,11 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
         time = outputs.time[skip:]
         for joint, asked in _torque_asked(robot.for_log(log), log).items():
             measured.setdefault(joint, []).append(asked)
-        torque.append(t)
         velocity.append(v)
         acceleration.append(_rate(v, time, episode.breaks - skip))
+        idle = (replay.index.actuator < 0) & ~np.any(np.abs(t) > TINY, axis=0)
+        own = replay.model.dof_M0[replay.index.dof] * acceleration[-1]
+        torque.append(np.where(idle, own, t))
         span.append(np.nanmax(q, axis=0) - np.nanmin(q, axis=0))
     model = robot.model
     t, v, a = (np.concatenate(x) for x in (torque, velocity, acceleration))
