@@ -103,7 +103,9 @@ def _tx40(model: str) -> Callable[[Path, Path, float], dict[str, Any]]:
                     regressed += baseline.friction[f"{kind}:{'+'.join(COUPLED)}"]
                 near = value is not None and abs(value / true - 1) <= 0.05
                 held = interval is not None and interval[0] <= true <= interval[1]
-                reached = near if k < 4 and kind != "rotor" else held
+                reached: bool | None = near if k < 4 and kind != "rotor" else held
+                if already:  # nothing is missing there
+                    reached = None
                 hand = TX40_HAND[kind][k] if kind in TX40_HAND else None
                 figures.append(Figure(f"{kind} {joint}", value, interval, true, hand, regressed, reached))
         for kind, true in TX40_COUPLING.items():
@@ -146,7 +148,9 @@ def _dfki(name: str) -> Callable[[Path, Path, float], dict[str, Any]]:
 def _open_loop(model: Path, log: Path, work: Path, params: Path) -> float | None:
     """Position rmse of a replay of the whole log under the result of a run, rad."""
     replayed = run(
-        ("replay", "--model", str(model), "--log", str(log), "--params", str(params), "--json"), work / log.stem, 300.0
+        ("replay", "--model", str(model), "--log", str(log), "--params", str(params), "--segments", "whole", "--json"),
+        work / log.stem,
+        300.0,
     )
     if not replayed.came_to_a_result:
         return None
