@@ -126,23 +126,7 @@ def _pairs(
                 f"the log has no {channel} column at all: {purpose}",
                 f"add `{channel}.<joint>` for each joint; the columns there are: {some(_all_columns(log), 12)}",
             )
-    if torques and not commands:
-        yield Problem(
-            "command.none",
-            "note",
-            "command.*",
-            "no command is logged: the measured torques are compared with those that the measured motion takes",
-            "nothing, if none was recorded; what limits, delays or gains of servos do cannot be found without it",
-        )
-    currents = [] if log.meta.torque_constant is None else [j for j in log.joints("current") if log.has("effort", j)]
-    if currents:
-        yield Problem(
-            "current.torque",
-            "note",
-            some([f"current.{joint}" for joint in currents]),
-            "the metadata state a torque constant: where no effort was logged, current times that constant is one",
-            "nothing, if that is right",
-        )
+    yield from _instead_of_commands(log, bool(torques) and not commands)
     if not commands or not positions:
         return
     only_command = [name for name in commands if name not in positions and name not in controls]
@@ -175,6 +159,27 @@ def _pairs(
             some(only_position),
             "these joints have a position but no command: what drove them is unknown",
             f"add {some([f'command.{name}' for name in only_position], 3)}, unless the joints are passive",
+        )
+
+
+def _instead_of_commands(log: Log, torques_alone: bool) -> Iterator[Problem]:
+    """What is read in the place of commands, and of efforts."""
+    if torques_alone:
+        yield Problem(
+            "command.none",
+            "note",
+            "command.*",
+            "no command is logged: the measured torques are compared with those that the measured motion takes",
+            "nothing, if none was recorded; what limits, delays or gains of servos do cannot be found without it",
+        )
+    currents = [] if log.meta.torque_constant is None else [j for j in log.joints("current") if log.has("effort", j)]
+    if currents:
+        yield Problem(
+            "current.torque",
+            "note",
+            some([f"current.{joint}" for joint in currents]),
+            "the metadata state a torque constant: where no effort was logged, current times that constant is one",
+            "nothing, if that is right",
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -233,19 +233,22 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
         'an object of channel or column and standard deviation (SI), e.g. {"position": 1e-4}',
     )
     extra = {key: value for key, value in raw.items() if key not in META_KEYS}
+    problems.extend(_misspelled_keys(extra, raw))
+    return LogMeta(**known, extra=extra)
+
+
+def _misspelled_keys(extra: Iterable[str], raw: Mapping[str, Any]) -> Iterator[Problem]:
+    """Keys that this release does not know, and that are nearly one that it does."""
     for key in extra:
         guess = closest(key, META_KEYS)
         if guess and guess not in raw:
-            problems.append(
-                Problem(
-                    "meta.unknown_key",
-                    "warning",
-                    f"file metadata, `{key}`",
-                    f"the schema has no key `{key}`, so it is kept but not used; did you mean `{guess}`?",
-                    f"rename it to `{guess}` if so",
-                )
+            yield Problem(
+                "meta.unknown_key",
+                "warning",
+                f"file metadata, `{key}`",
+                f"the schema has no key `{key}`, so it is kept but not used; did you mean `{guess}`?",
+                f"rename it to `{guess}` if so",
             )
-    return LogMeta(**known, extra=extra)
 
 
 def _numbers(value: object) -> bool:
