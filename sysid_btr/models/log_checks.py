@@ -122,7 +122,8 @@ def _undriven(log: Log, model: mujoco.MjModel, drives: Sequence[Drive], joints: 
             "error",
             some([f"command.{name}" for name in commands]),
             "the model has no joint and no actuator of these names: the commands drive nothing",
-            f"give the columns the names of joints ({some(joints, 12)}) or actuators",
+            f"give the model of this robot; or give the columns the names of joints ({some(joints, 12)}) or actuators, "
+            "as `sysid-btr import --rename` does",
         )
 
 
