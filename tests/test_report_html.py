@@ -262,7 +262,7 @@ def test_results_show_themselves_in_a_notebook(fitted: Fit) -> None:
         assert "mass:arm" in text
         assert "95 % interval" in text
     assert "samples" in fitted.study.train[0].log._repr_html_()
-    assert "with a servo" in fitted.study.robot._repr_html_()
+    assert "with a drive" in fitted.study.robot._repr_html_()
 
 
 # --- a real browser -----------------------------------------------------------------------------------------
