@@ -367,7 +367,9 @@ def test_back_emf_damps_a_driven_joint_as_friction_does_and_a_released_one_not()
     np.testing.assert_allclose(position(pendulum(), log, [at_arm(BackEmf)], [0.05]), damped, atol=2e-4)
     assert np.abs(damped - position(pendulum(), log)).max() > 1e-2
     released = make_log(log.time, {**log.channels, "enabled.arm": np.zeros(len(log.time))})
-    np.testing.assert_array_equal(position(pendulum(), released, [at_arm(BackEmf)], [0.05]), position(pendulum(), log))
+    swinging = position(pendulum(), released)
+    np.testing.assert_array_equal(position(pendulum(), released, [at_arm(BackEmf)], [0.05]), swinging)
+    assert np.abs(swinging - damped).max() > 1e-2
 
 
 def test_back_emf_moves_the_limits_of_the_torque_with_the_speed() -> None:

@@ -194,6 +194,8 @@ DERIVED = {
 }  # fmt: skip
 """What follows from other fields (bounding volumes lie in the frame of the inertia), or counts only with friction."""
 OPTIONS = {"opt.timestep", "opt.integrator"}
+UNUSED = {"actuator_dynprm"}
+"""MuJoCo's default time constant of drives without a filter, which a replay sets to zero."""
 
 
 # --- text -----------------------------------------------------------------------------------------------
@@ -280,7 +282,10 @@ def test_the_file_compiles_to_the_model_that_was_replayed(own: Path, out: Folder
     assert made.source.own
     path = out.write("model.xml", made.text())
     before, after = mujoco.MjModel.from_xml_path(str(own)), mujoco.MjModel.from_xml_path(str(path))
-    assert not changed_fields(after, made.target.model) - DERIVED
+    bare = mujoco.MjSpec.from_file(str(path))
+    for key in list(bare.keys):  # the file keeps its keyframes; no replay has them
+        bare.delete(key)
+    assert not changed_fields(bare.compile(), made.target.model) - DERIVED - UNUSED
     assert changed_fields(before, after) - DERIVED - OPTIONS == wanted
     assert save_model(out, made)["reproduces"]
 
