@@ -34,6 +34,8 @@ class Unit:
 SI: Mapping[str, tuple[str, ...]] = {
     "time": ("s",),
     "command": ("rad", "m", "rad/s", "m/s", "Nm", "N", "A", "V", "1"),
+    "command_velocity": ("rad/s", "m/s"),
+    "command_effort": ("Nm", "N"),
     "position": ("rad", "m"),
     "velocity": ("rad/s", "m/s"),
     "effort": ("Nm", "N"),
