@@ -34,6 +34,7 @@ class FootFriction(Effect):
     """
 
     name: ClassVar[str] = "foot_friction"
+    family: ClassVar[str] = "contact"
     field: ClassVar[str] = "foot_friction"
     title: ClassVar[str] = "change of the ground's friction"
     scope: ClassVar[Scope] = "robot"
@@ -78,6 +79,7 @@ class FootCompliance(Effect):
     """
 
     name: ClassVar[str] = "foot_compliance"
+    family: ClassVar[str] = "contact"
     title: ClassVar[str] = "change of the ground's softness"
     scope: ClassVar[Scope] = "robot"
     declared_at: ClassVar[Scope | None] = "body"

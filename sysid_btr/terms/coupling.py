@@ -28,6 +28,7 @@ class DriveCoupling(Effect):
     """
 
     name: ClassVar[str] = "drive_coupling"
+    family: ClassVar[str] = "coupling"
     title: ClassVar[str] = "drive shared with the next joint"
     needs: ClassVar[str] = "effort"
     variant: ClassVar[str] = "sum"

@@ -21,6 +21,7 @@ class ConstantForce(Effect):
     """
 
     name: ClassVar[str] = "constant_force"
+    family: ClassVar[str] = "disturbance"
     title: ClassVar[str] = "constant torque"
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "Nm", 0.0, -10.0, 10.0, 0.05),)
@@ -48,6 +49,7 @@ class ExternalDisturbance(Effect):
     """
 
     name: ClassVar[str] = "external_disturbance"
+    family: ClassVar[str] = "disturbance"
     title: ClassVar[str] = "push from outside"
     held: ClassVar[tuple[str, ...]] = ("start", "duration")
     transient: ClassVar[bool] = True
@@ -94,6 +96,7 @@ class ExternalDisturbanceTrain(Effect):
     """
 
     name: ClassVar[str] = "external_disturbance"
+    family: ClassVar[str] = "disturbance"
     variant: ClassVar[str] = "train"
     title: ClassVar[str] = "push from outside that comes again and again"
     held: ClassVar[tuple[str, ...]] = ("start", "duration", "period")

@@ -34,6 +34,7 @@ class Effect(Term):
     Class attributes
     ----------------
     name : as in results and on the command line.
+    family : what physical cause it is a form of (``friction``, ``delay``, ...); empty if it is one of its own.
     title : in a sentence, after an amount: "0.33 Nm of dry friction".
     usual : whether it is looked for where the user names no effects.
     scope : which names it can sit at.
@@ -51,6 +52,7 @@ class Effect(Term):
     """
 
     title: ClassVar[str] = ""
+    family: ClassVar[str] = ""
     usual: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = ()
     needs: ClassVar[str] = "position"

@@ -24,6 +24,7 @@ class CoulombFriction(DofEffect):
     """
 
     name: ClassVar[str] = "coulomb_friction"
+    family: ClassVar[str] = "friction"
     field: ClassVar[str] = "frictionloss"
     compiled: ClassVar[str] = "dof_frictionloss"
     title: ClassVar[str] = "dry friction"
@@ -65,6 +66,7 @@ class ViscousDamping(Damping):
     """
 
     name: ClassVar[str] = "viscous_damping"
+    family: ClassVar[str] = "friction"
     field: ClassVar[str] = "damping"
     compiled: ClassVar[str] = "dof_damping"
     title: ClassVar[str] = "viscous damping"
@@ -88,6 +90,7 @@ class QuadraticDamping(Damping):
     """
 
     name: ClassVar[str] = "quadratic_damping"
+    family: ClassVar[str] = "friction"
     field: ClassVar[str] = "quadratic_damping"
     compiled: ClassVar[str] = "dof_dampingpoly"
     title: ClassVar[str] = "quadratic damping"
@@ -119,6 +122,7 @@ class StribeckFriction(Effect):
     """
 
     name: ClassVar[str] = "stribeck_friction"
+    family: ClassVar[str] = "friction"
     title: ClassVar[str] = "friction that falls with speed"
     law_acts: ClassVar[tuple[str, ...]] = ("friction",)
     kinds: ClassVar[tuple[Kind, ...]] = (
@@ -182,6 +186,7 @@ class LoadFriction(Effect):
     """
 
     name: ClassVar[str] = "load_friction"
+    family: ClassVar[str] = "friction"
     title: ClassVar[str] = "friction per unit of load"
     scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("friction",)

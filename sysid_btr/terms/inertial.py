@@ -81,6 +81,7 @@ class Armature(DofEffect):
     """
 
     name: ClassVar[str] = "armature"
+    family: ClassVar[str] = "inertia"
     field: ClassVar[str] = "armature"
     compiled: ClassVar[str] = "dof_armature"
     title: ClassVar[str] = "rotor inertia"
@@ -115,6 +116,7 @@ class Payload(Effect):
     """
 
     name: ClassVar[str] = "payload"
+    family: ClassVar[str] = "payload"
     title: ClassVar[str] = "payload"
     scope: ClassVar = "body"
     signed: ClassVar[bool] = True
@@ -209,6 +211,7 @@ class ComOffset(Effect):
     """
 
     name: ClassVar[str] = "com_offset"
+    family: ClassVar[str] = "payload"
     also: ClassVar[tuple[str, ...]] = ("com",)
     title: ClassVar[str] = "shift of the centre of mass"
     scope: ClassVar = "body"
@@ -241,6 +244,7 @@ class GravityTilt(Effect):
     """
 
     name: ClassVar[str] = "gravity_tilt"
+    family: ClassVar[str] = "mount"
     title: ClassVar[str] = "tilt of the mount"
     scope: ClassVar = "robot"
     signed: ClassVar[bool] = True

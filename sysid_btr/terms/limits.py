@@ -26,6 +26,7 @@ class TorqueLimit(Effect):
     """
 
     name: ClassVar[str] = "torque_limit"
+    family: ClassVar[str] = "saturation"
     field: ClassVar[str] = "force_limit"
     title: ClassVar[str] = "limit of the torque"
     scope: ClassVar = "drive"
@@ -74,6 +75,7 @@ class SpeedTorqueLimit(Effect):
     """
 
     name: ClassVar[str] = "speed_torque_limit"
+    family: ClassVar[str] = "saturation"
     title: ClassVar[str] = "torque limit that falls with speed"
     scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("limit",)
@@ -116,6 +118,7 @@ class SlewLimit(Effect):
     """
 
     name: ClassVar[str] = "slew_limit"
+    family: ClassVar[str] = "saturation"
     title: ClassVar[str] = "limit of the commanded rate"
     scope: ClassVar = "servo"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("rate", "rad/s", 1000.0, 0.05, 1000.0, 0.2),)

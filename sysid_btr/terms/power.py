@@ -21,6 +21,7 @@ class VoltageSag(Effect):
     """
 
     name: ClassVar[str] = "voltage_sag"
+    family: ClassVar[str] = "supply"
     title: ClassVar[str] = "loss of supply voltage per second"
     scope: ClassVar = "robot"
     variant: ClassVar[str] = "time"
@@ -89,6 +90,7 @@ class ThermalDerating(Effect):
     """
 
     name: ClassVar[str] = "thermal_derating"
+    family: ClassVar[str] = "supply"
     title: ClassVar[str] = "loss of torque with heat"
     scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)

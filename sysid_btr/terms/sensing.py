@@ -22,6 +22,7 @@ class EncoderOffset(Effect):
     """
 
     name: ClassVar[str] = "encoder_offset"
+    family: ClassVar[str] = "sensor"
     title: ClassVar[str] = "offset of the encoder"
     variant: ClassVar[str] = "log"
     signed: ClassVar[bool] = True
@@ -69,6 +70,7 @@ class EncoderScale(Effect):
     """
 
     name: ClassVar[str] = "encoder_scale"
+    family: ClassVar[str] = "sensor"
     title: ClassVar[str] = "error of the encoder's scale"
     variant: ClassVar[str] = "log"
     signed: ClassVar[bool] = True
@@ -114,6 +116,7 @@ class SensorDelay(Effect):
     """
 
     name: ClassVar[str] = "sensor_delay"
+    family: ClassVar[str] = "delay"
     title: ClassVar[str] = "delay of the sensor"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("time", "s", 0.0, 0.0, 0.15, 0.004),)
     needs: ClassVar[str] = "position, and a sensor or a coupled joint that is not delayed"
@@ -155,6 +158,7 @@ class TorqueOffset(Effect):
     """
 
     name: ClassVar[str] = "torque_offset"
+    family: ClassVar[str] = "sensor"
     title: ClassVar[str] = "offset of the torque sensor"
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("offset", "Nm", 0.0, -10.0, 10.0, 0.05),)
@@ -182,6 +186,7 @@ class TorqueScale(Effect):
     """
 
     name: ClassVar[str] = "torque_scale"
+    family: ClassVar[str] = "sensor"
     title: ClassVar[str] = "error of the torque sensor's scale"
     signed: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("error", "1", 0.0, -0.5, 1.0, 0.02),)

@@ -112,6 +112,7 @@ class IntegralGain(Effect):
     """
 
     name: ClassVar[str] = "integral_gain"
+    family: ClassVar[str] = "servo law"
     title: ClassVar[str] = "integral action of the servo"
     scope: ClassVar = "servo"
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
@@ -146,6 +147,7 @@ class BackEmf(Effect):
     """
 
     name: ClassVar[str] = "back_emf"
+    family: ClassVar[str] = "friction"
     title: ClassVar[str] = "damping by back-EMF"
     scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "limit")
@@ -178,6 +180,7 @@ class ActuatorFilter(Effect):
     """
 
     name: ClassVar[str] = "actuator_filter"
+    family: ClassVar[str] = "delay"
     field: ClassVar[str] = "filter_time"
     title: ClassVar[str] = "filter of the command"
     scope: ClassVar[Scope] = "drive"
@@ -216,6 +219,7 @@ class CommandDelay(Effect):
     """
 
     name: ClassVar[str] = "command_delay"
+    family: ClassVar[str] = "delay"
     also: ClassVar[tuple[str, ...]] = ("delay",)
     title: ClassVar[str] = "delay of the command"
     scope: ClassVar = "drive"

@@ -25,6 +25,7 @@ class JointSpring(Effect):
     """
 
     name: ClassVar[str] = "joint_spring"
+    family: ClassVar[str] = "spring"
     field: ClassVar[str] = "stiffness"
     title: ClassVar[str] = "spring across the joint"
     signed: ClassVar[bool] = True

@@ -40,6 +40,7 @@ class Backlash(Effect):
     """
 
     name: ClassVar[str] = "backlash"
+    family: ClassVar[str] = "backlash"
     title: ClassVar[str] = "play in the gear"
     variant: ClassVar[str] = "link"
     scope: ClassVar = "drive"
@@ -136,6 +137,7 @@ class JointCompliance(Effect):
     """
 
     name: ClassVar[str] = "joint_compliance"
+    family: ClassVar[str] = "compliance"
     title: ClassVar[str] = "softness of the gear"
     variant: ClassVar[str] = "link"
     scope: ClassVar = "drive"
@@ -195,6 +197,7 @@ class Cogging(Effect):
     """
 
     name: ClassVar[str] = "cogging"
+    family: ClassVar[str] = "cogging"
     title: ClassVar[str] = "torque that repeats with the angle"
     held: ClassVar[tuple[str, ...]] = ("number",)
     signed: ClassVar[bool] = True
