@@ -45,6 +45,13 @@ def test_held_commands_stay_steps_and_sensors_end_where_nothing_is_known() -> No
     assert np.isnan(moved.channels["position.knee"][-9:]).all()
 
 
+def test_what_is_fed_forward_is_held_as_the_command_is() -> None:
+    log = swinging(0.0, hold="zoh")
+    fed = replace(log, channels={**log.channels, "command_velocity.knee": 3 * log.channels["command.knee"]})
+    moved = shift_streams(fed, {"command": 0.123, "command_velocity": 0.123}).channels
+    np.testing.assert_array_equal(moved["command_velocity.knee"], 3 * moved["command.knee"])
+
+
 def test_episodes_do_not_flow_into_each_other() -> None:
     log = swinging(0.0)
     two = replace(log, episode=np.repeat([0, 1], 500))

@@ -15,8 +15,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.identify.episode import Episode
 from sysid_btr.identify.horizon import is_held
 from sysid_btr.identify.segmented import follow
-from sysid_btr.io.log import Log
-from sysid_btr.models.commands import FED_FORWARD
+from sysid_btr.io.log import COMMANDS, Log
 from sysid_btr.models.robot import Robot, joint_names
 
 AUTO, WHOLE = "auto", "whole"
@@ -135,8 +134,7 @@ def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str
 def _commanded(log: Log) -> bool:
     """Whether anything was commanded, at a joint or an actuator."""
     return any(
-        name.partition(".")[0] in ("command", *FED_FORWARD) and bool(np.isfinite(values).any())
-        for name, values in log.channels.items()
+        name.partition(".")[0] in COMMANDS and bool(np.isfinite(values).any()) for name, values in log.channels.items()
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.numerics import choose_numerics
-from sysid_btr.io.log import Log
+from sysid_btr.io.log import COMMANDS, Log
 from sysid_btr.io.split import split_episodes
 from sysid_btr.models.log_checks import require_drives
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.identify.episode import Episode
     from sysid_btr.models.robot import Robot
+    from sysid_btr.terms.base import Outputs
 
 
 def replay_log(
@@ -69,12 +70,9 @@ def replay_log(
     for episode in episodes:
         run = Replay(robot.for_log(episode), episode, model.terms, chosen, effort=True, threads=threads)
         outputs = run.predict(model.values[None])
-        for i, joint in enumerate(run.index.joints):
-            parts.setdefault(f"position.{joint}", []).append(outputs.position[0, :, i])
-            parts.setdefault(f"velocity.{joint}", []).append(outputs.velocity[0, :, i])
-            if outputs.effort is not None:
-                parts.setdefault(f"effort.{joint}", []).append(outputs.effort[0, :, i])
-    commands = {name: column for name, column in log.channels.items() if name.startswith("command.")}
+        for name, column in _sensors(run.index.joints, outputs).items():
+            parts.setdefault(name, []).append(column)
+    commands = {name: column for name, column in log.channels.items() if name.partition(".")[0] in COMMANDS}
     rows = [i for s in log.episodes() if s.stop - s.start > 1 for i in range(s.start, s.stop)]
     return replace(
         log,
@@ -106,13 +104,7 @@ def predicted_log(episodes: Sequence[Episode], model: Model, numerics: Numerics,
     parts = []
     for number, episode in enumerate(episodes):
         run = episode.replay(model.terms, numerics, effort=True, threads=threads)
-        outputs = run.predict(model.values[None])
-        channels = {}
-        for i, joint in enumerate(run.index.joints):
-            channels[f"position.{joint}"] = outputs.position[0, :, i]
-            channels[f"velocity.{joint}"] = outputs.velocity[0, :, i]
-            if outputs.effort is not None:
-                channels[f"effort.{joint}"] = outputs.effort[0, :, i]
+        channels = _sensors(run.index.joints, run.predict(model.values[None]))
         own = replace(episode.log.meta, source=f"predicted: {episode.robot.name}", units={})
         parts.append(Log(episode.log.time, channels, own, np.full(len(episode.log), number)))
     return replace(
@@ -121,6 +113,13 @@ def predicted_log(episodes: Sequence[Episode], model: Model, numerics: Numerics,
         channels={name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels},
         episode=np.concatenate([part.episode for part in parts]),
     )
+
+
+def _sensors(joints: Sequence[str], outputs: Outputs) -> dict[str, FloatArray]:
+    """Columns of a log, (n,) each, with what one candidate's sensors show."""
+    parts = (("position", outputs.position), ("velocity", outputs.velocity), ("effort", outputs.effort))
+    shown = [(channel, array[0].T) for channel, array in parts if array is not None]
+    return {f"{c}.{joint}": column for c, columns in shown for joint, column in zip(joints, columns, strict=True)}
 
 
 def set_parameters(robot: Robot, parameters: Mapping[str, float]) -> Model:

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from sysid_btr.io._text import mirrored, some
-from sysid_btr.io.log import CHANNELS, IMU_NAMES, JOINT_CHANNELS, Log, closest
+from sysid_btr.io.log import CHANNELS, COMMANDS, IMU_NAMES, JOINT_CHANNELS, Log, closest
 from sysid_btr.io.problem import Problem
 
-MOVERS = ("command_velocity", "command_effort", "effort", "current")
+MOVERS = (*COMMANDS[1:], "effort", "current")
 """Channels that say what moved a joint where no command does."""
 
 

@@ -20,10 +20,11 @@ T = TypeVar("T")
 
 SCHEMA_VERSION = 1
 
+COMMANDS = ("command", "command_velocity", "command_effort")
+"""Channels of what joints are told: the first by itself, the others alone or fed forward beside it."""
+
 JOINT_CHANNELS = (
-    "command",
-    "command_velocity",
-    "command_effort",
+    *COMMANDS,
     "position",
     "velocity",
     "effort",
@@ -180,7 +181,7 @@ class Log:
     @property
     def is_motion(self) -> bool:
         """Whether this is a motion to be played, by its own account and by what it holds: commands alone."""
-        return self.meta.source == MOTION and all(column.startswith("command.") for column in self.channels)
+        return self.meta.source == MOTION and all(column.partition(".")[0] in COMMANDS for column in self.channels)
 
     def joints(self, channel: str) -> tuple[str, ...]:
         """Names that have a column in `channel`, in column order."""

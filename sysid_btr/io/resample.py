@@ -11,7 +11,7 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._clock import SNAP, gaps, holding_sample, typical_interval
-from sysid_btr.io.log import Log
+from sysid_btr.io.log import COMMANDS, Log
 
 _SET_CHANNELS = ("enabled", "stiffness")
 """Channels that are set and stay, whatever the commands do."""
@@ -114,6 +114,11 @@ def command_at(log: Log, names: Sequence[str], times: FloatArray, channel: str =
     return blended
 
 
+def holds(log: Log, channel: str) -> bool:
+    """Whether a value of a channel stays in force until the next sample."""
+    return channel in _SET_CHANNELS or (channel in COMMANDS and log.meta.command_hold == "zoh")
+
+
 def _require_increasing(log: Log, *, across_episodes: bool = False) -> None:
     if len(log) == 0:
         raise LogError("the log has no samples")
@@ -175,8 +180,7 @@ def _at(log: Log, column: str, grid: FloatArray, held: IntArray, in_gap: BoolArr
     time, values = log.time, log.channels[column]
     channel = column.partition(".")[0]
     at_sample = values[held]
-    holds = channel in _SET_CHANNELS or (channel.startswith("command") and log.meta.command_hold == "zoh")
-    if holds or len(time) < 2:
+    if holds(log, channel) or len(time) < 2:
         return np.where(in_gap, np.nan, at_sample)
     # Interpolation knows no snapping, except where it would lose a sample to a NaN beside it.
     before = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, len(time) - 2)

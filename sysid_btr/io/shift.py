@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.io.log import Log
-
-HELD = ("enabled", "stiffness")
-"""Channels that are set and stay."""
+from sysid_btr.io.log import COMMANDS, Log
+from sysid_btr.io.resample import holds
 
 
 def shift_streams(log: Log, seconds: Mapping[str, float]) -> Log:
@@ -42,13 +40,13 @@ def shift_streams(log: Log, seconds: Mapping[str, float]) -> Log:
 
 def _later(log: Log, channel: str, time: FloatArray, values: FloatArray, late: float) -> FloatArray:
     wanted = time - late
-    if channel in HELD or (channel == "command" and log.meta.command_hold == "zoh"):
+    if holds(log, channel):
         at = np.clip(np.searchsorted(time, wanted + 1e-9, side="right") - 1, 0, len(time) - 1)
         return np.asarray(values[at])
     good = np.isfinite(values)
     if not good.any():
         return values
     found = np.interp(wanted, time[good], values[good])
-    if channel != "command":
+    if channel not in COMMANDS:
         found[(wanted < time[0]) | (wanted > time[-1])] = np.nan
     return np.asarray(found)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.io.log import Log
+from sysid_btr.io.log import COMMANDS, Log
 from sysid_btr.terms.drives import Drive, joint_drives, own_controls
 
 if TYPE_CHECKING:
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 MEASURED = "effort"
 """Channel that stands in for the command of a torque drive: what the motor gave is what it was asked for."""
-FED_FORWARD = ("command_velocity", "command_effort")
+FED_FORWARD = COMMANDS[1:]
 """Channels that are commanded beside a position, as in torque = kp (q* - q) + kd (v* - v) + tau*."""
-OWN_CHANNEL = {"position": "command", "velocity": "command_velocity", "torque": "command_effort"}
+OWN_CHANNEL = dict(zip(("position", "velocity", "torque"), COMMANDS, strict=True))
 """Kind of drive -> channel of the same meaning, for a log that says of each command what it is."""
 
 
@@ -28,7 +28,7 @@ def commanded(log: Log, model: mujoco.MjModel) -> Log:
     its measured torque. What is fed forward stays in its own channels where it is beside a command.
     """
     given = log.channels
-    channels = {name: values for name, values in given.items() if not name.startswith("command")}
+    channels = {name: values for name, values in given.items() if name.partition(".")[0] not in COMMANDS}
     for name in own_controls(model):
         if f"command.{name}" in given:
             channels[f"command.{name}"] = given[f"command.{name}"]
