@@ -15,7 +15,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.close import close
 from sysid_btr.errors import ModelError
 from sysid_btr.identify.fit import fit
-from sysid_btr.identify.mode import Mode
+from sysid_btr.identify.mode import Mode, episode_of
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
@@ -23,7 +23,7 @@ from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.problem import Problem
 from sysid_btr.io.validation import validate_log
 from sysid_btr.models.log_checks import check_log
-from sysid_btr.models.robot import Robot
+from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Outputs, Term
@@ -197,6 +197,15 @@ def test_a_position_is_commanded_with_velocity_and_torque_fed_forward() -> None:
     np.testing.assert_allclose(found.effort[0, :-1, 0], law, rtol=0, atol=1e-9)
 
 
+def test_a_replayed_log_keeps_all_of_its_commands() -> None:
+    robot = arm('<position name="{j}" joint="{j}" kp="0.3" kv="0.02" gear="10"/>')
+    log = commands(command__shoulder=WAVE, command_velocity__shoulder=2 * WAVE, command_effort__shoulder=0.3 * WAVE)
+    once = replay_log(robot, log, numerics=NUMERICS)
+    again = replay_log(robot, once, numerics=NUMERICS)
+    # it starts where its first samples are, which a line through them averages
+    np.testing.assert_allclose(again.channels["position.shoulder"], once.channels["position.shoulder"], atol=1e-5)
+
+
 def test_the_gain_of_a_velocity_servo_is_one_number() -> None:
     robot, log = arm(ACTUATORS["velocity"]), commands(command__shoulder=WAVE, command__elbow=WAVE)
     terms = parse_parameters(["kv:shoulder,elbow=shared"], robot)
@@ -334,7 +343,20 @@ def test_a_joint_that_is_not_logged_stands_where_it_is_said_to() -> None:
     with pytest.raises(ModelError, match="no joint wrist"):
         start(replace(robot, at=(("wrist", 1.0),)), log)
     with pytest.raises(ModelError, match="its keyframes: a, b"):
-        start(replace(robot, at=(("keyframe:c", 0.0),)), log)
+        start(replace(robot, at=("keyframe:c",)), log)
+
+
+def test_an_unlogged_joint_stands_where_it_is_told_to_in_every_mode() -> None:
+    """By the same log, of which nothing that was found of it elsewhere may be used again."""
+    more = ACTUATORS["position"].format(j="shoulder") + ACTUATORS["position"].format(j="elbow")
+    robot = robot_from_xml(ARM.format(more=f"<actuator>{more}</actuator>"))
+    log = commands(command__shoulder=WAVE, position__shoulder=WAVE, effort__shoulder=WAVE)
+    elbow = joint_names(robot).index("elbow")
+    for angle in (0.0, -0.4, 0.7):
+        told = replace(robot, at=(("elbow", angle),))
+        for episode in (episode_of(told, log, Mode("inverse")), episode_of(told, log, Mode("segments", "0.5"))):
+            position = episode.replay((), NUMERICS).predict(np.zeros((1, 0))).position[0]
+            assert position[0, elbow] == angle
 
 
 QUADRUPED = """

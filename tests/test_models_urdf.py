@@ -102,11 +102,13 @@ def test_a_joint_that_mimics_another_has_no_motor(write: Write) -> None:
 
 
 def test_servos_take_the_place_of_motors_with_the_gains_that_are_stated(write: Write) -> None:
-    robot = with_servos(load_robot(str(write())), Servo(kp=80, kv=3))
+    robot = load_robot(str(write(mesh=MESH.replace("upper.stl", "torque motor.stl"))), Servo(kp=80, kv=3))
     assert servo_joints(robot) == ("shoulder", "elbow")
     assert robot.model.nu == 2
     np.testing.assert_array_equal(robot.model.actuator_biasprm[:, 1:3], [[-80, -3]] * 2)
-    assert with_servos(robot, Servo(kp=1)) is not None
+    left_out, put = robot.remarks
+    assert "torque motor.stl" in left_out
+    assert put == "position servos of kp 80 and kv 3 are put on shoulder, elbow"
     assert _gains(with_servos(robot, Servo(kp=1))) == [80, 80]
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sysid_btr._typing import FloatArray
     from sysid_btr.io.log import Log
     from sysid_btr.models.actuation import Servo
-    from sysid_btr.models.robot import Robot
+    from sysid_btr.models.robot import Position, Robot
     from sysid_btr.terms.base import Parameter
 
 
@@ -23,7 +23,6 @@ def find_robot(options: ModelOptions, bounds: Ranges | None = None) -> Robot:
     """The robot called for, with the bounds given to its parameters; what was changed of its file is told."""
     from dataclasses import replace
 
-    from sysid_btr.models.actuation import with_servos
     from sysid_btr.models.builtin import BUILTIN, load_robot
 
     name = options.model
@@ -31,9 +30,8 @@ def find_robot(options: ModelOptions, bounds: Ranges | None = None) -> Robot:
     if name is None:
         built_in = f" ({', '.join(sorted(BUILTIN))})" if BUILTIN else ""
         raise UsageError(f"which robot? Give --model: a built-in name{built_in} or an MJCF or URDF file")
-    robot = replace(load_robot(name), at=_positions(options.at))
-    if options.servo:
-        robot = with_servos(robot, _servo(options.servo))
+    servo = _servo(options.servo) if options.servo else None
+    robot = replace(load_robot(name, servo), at=_positions(options.at))
     for said in robot.remarks:
         remark(f"note: {name}: {said}")
     if not bounds:
@@ -42,11 +40,11 @@ def find_robot(options: ModelOptions, bounds: Ranges | None = None) -> Robot:
     return replace(robot, bounds={**robot.bounds, **bounds})
 
 
-def _positions(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
-    """Joints and where they stand; a keyframe with zero."""
-    from sysid_btr.models.pose import KEYFRAME
+def _positions(given: Sequence[str]) -> tuple[Position, ...]:
+    """Joints and where they stand, and keyframes."""
+    from sysid_btr.models.robot import KEYFRAME
 
-    return tuple((text, 0.0) if text.startswith(KEYFRAME) else _equation("--at", text) for text in given)
+    return tuple(text if text.startswith(KEYFRAME) else _equation("--at", text) for text in given)
 
 
 def _servo(given: Sequence[str]) -> Servo:

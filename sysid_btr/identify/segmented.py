@@ -17,13 +17,14 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError, ModelError
-from sysid_btr.identify.episode import Episode, Inflation, Procedure
+from sysid_btr.identify.episode import Episode, Procedure
 from sysid_btr.identify.horizon import linear_seconds
 from sysid_btr.identify.initial_states import respond, update_initial_states
 from sysid_btr.identify.numerics import choose_numerics, converged, largest_step
 from sysid_btr.identify.smoothing import Tracks, smooth_joints
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split
+from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.marginal import Marginal
 from sysid_btr.objectives.problem import BLOCK, Comparison
@@ -31,7 +32,6 @@ from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import SegmentReplay, Segments, covered, segment_seconds, spread_evenly
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.model import Terms
 
 WIDENED = 2.0
 """Factor on the smoother's standard deviations: it has used the segment's own samples as well."""
@@ -140,16 +140,7 @@ class SegmentedEpisode(Episode):
         robot = self.robot.for_log(self.log)
         return SegmentReplay(robot, self.log, tuple(terms), numerics, effort, threads, segments=self.segments)
 
-    def compare(
-        self,
-        terms: Terms,
-        channels: Sequence[str],
-        numerics: Numerics,
-        *,
-        inflation: Inflation | None = None,
-        threads: int = 0,
-    ) -> Comparison:
-        plain = super().compare(terms, channels, numerics, inflation=inflation, threads=threads)
+    def completed(self, plain: Comparison) -> Comparison:
         # what is left in one segment is correlated all along it
         seconds = segment_seconds(self.segments, self.log)
         return replace(plain, marginal=self.marginal, stretch=seconds * np.ceil(BLOCK / seconds))
@@ -231,7 +222,7 @@ class Followed:
 
 def follow(robot: Robot, log: Log, threads: int = 0) -> Followed:
     """How long replays of a log can be followed, see `linear_seconds`."""
-    return log.once(("followed", robot.fingerprint), lambda: _follow(robot, log, threads))
+    return log.once(("followed", robot.fingerprint, robot.at), lambda: _follow(robot, log, threads))
 
 
 def _follow(robot: Robot, log: Log, threads: int) -> Followed:
@@ -249,7 +240,7 @@ def measured_motion(robot: Robot, log: Log) -> Tracks:
     """Positions and velocities of the model's joints, (n, j), from what the log has of their positions.
 
     From positions alone: a logged velocity is the encoder's, filtered, and no second measurement. A joint whose
-    position is not logged stays where the model has it.
+    position is not logged stays where it rests.
 
     Raises
     ------
@@ -258,15 +249,15 @@ def measured_motion(robot: Robot, log: Log) -> Tracks:
     """
     configured = robot.for_log(log)
     joints = joint_names(configured)
+    rest = resting(configured, log, joints)
     known = [k for k, j in enumerate(joints) if log.has("position", j)]
     if not known:
         raise LogError(f"log {log.path or ''}: segments start from measured positions, and it has none of this model")
-    return log.once(("tracks", joints), lambda: _smoothed(configured, log, joints, known))
+    return log.once(("tracks", joints, tuple(rest)), lambda: _smoothed(log, joints, known, rest))
 
 
-def _smoothed(robot: Robot, log: Log, joints: Sequence[str], known: Sequence[int]) -> Tracks:
-    model, shape = robot.model, (len(log), len(joints))
-    rest = np.array([model.qpos0[model.jnt_qposadr[model.joint(j).id]] for j in joints])
+def _smoothed(log: Log, joints: Sequence[str], known: Sequence[int], rest: FloatArray) -> Tracks:
+    shape = (len(log), len(joints))
     position, velocity = np.tile(rest, (len(log), 1)), np.zeros(shape)
     acceleration, position_std, velocity_std = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     found = smooth_joints(log.time - log.time[0], log.array("position", [joints[k] for k in known]))

@@ -55,9 +55,8 @@ def with_servos(robot: Robot, servo: Servo) -> Robot:
     model = robot.model
     fed = {drive.joint for drive in joint_drives(model) if drive.kind != "torque"} | set(crowded_joints(model))
     chosen = tuple(joint for joint in _free_joints(model) if joint not in fed)
-    kept = tuple(r for r in robot.remarks if "torque motor" not in r)
     remark = f"position servos of kp {servo.kp:g} and kv {servo.kv:g} are put on {some(chosen, 12)}"
-    return _with(replace(robot, remarks=kept), servo, chosen, remark) if chosen else robot
+    return _with(robot, servo, chosen, remark) if chosen else robot
 
 
 def _with(robot: Robot, drive: Servo | Motor, joints: tuple[str, ...], remark: str) -> Robot:

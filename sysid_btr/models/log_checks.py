@@ -37,7 +37,7 @@ def check_log(robot: Robot, log: Log) -> tuple[Problem, ...]:
         controls=tuple(own_controls(robot.model)),
         at=standing(robot, log),
     )
-    return worst_first((*content, *command_problems(log, robot.model)))
+    return worst_first((*content, *command_problems(robot, log)))
 
 
 def require_drives(robot: Robot, logs: Iterable[Log]) -> None:
@@ -48,14 +48,18 @@ def require_drives(robot: Robot, logs: Iterable[Log]) -> None:
     ModelError
         With every such problem of every log.
     """
-    found = {log: errors_of(tuple(command_problems(log, robot.for_log(log).model))) for log in logs}
+    found = {log: errors_of(command_problems(robot.for_log(log), log)) for log in logs}
     told = [explain(log.path or "the log", problems) for log, problems in found.items() if problems]
     if told:
         raise ModelError("\n".join(told))
 
 
-def command_problems(log: Log, model: mujoco.MjModel) -> Iterator[Problem]:
+def command_problems(robot: Robot, log: Log) -> tuple[Problem, ...]:
     """Commands that drive nothing, or not what they say; and drives that nothing commands."""
+    return log.once(("commands", robot.fingerprint), lambda: tuple(_command_problems(log, robot.model)))
+
+
+def _command_problems(log: Log, model: mujoco.MjModel) -> Iterator[Problem]:
     drives, joints = joint_drives(model), _joints(model)
     yield from _undriven(log, model, drives, joints)
     twice = [", ".join(names) for names in (tuple(command_columns(log, d)) for d in drives) if len(names) > 1]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr.errors import ModelError
-from sysid_btr.models.urdf import is_urdf, read_urdf
+from sysid_btr.models.urdf import read_urdf
 from sysid_btr.mujoco_conventions import SINGLE, slides
 from sysid_btr.terms.base import Scope, Term
 from sysid_btr.terms.drives import Drive, joint_drives
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     import mujoco
 
     from sysid_btr.io.log import Log
+
+KEYFRAME = "keyframe:"
+"""Begins the name of a pose of the model."""
+Position = str | tuple[str, float]
+"""A joint and where it stands, rad or m; or a pose of the model, for all of them."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +44,10 @@ class Robot:
     tied : groups of joints driven by one motor; their gains are one parameter.
     always : terms without parameters of their own that belong to the robot (drive electronics).
     fields : ``FIELD`` -> term of the parameters that this robot has beyond those of the grammar.
-    at : joints with the positions at which they stand, and ``keyframe:NAME`` with any number for all, in the order in
-        which they were told; for what a log does not measure.
+    at : joints with the positions at which they stand, and ``keyframe:NAME`` for all, in the order in which they were
+        told; for what a log does not measure.
     remarks : what of its file was left out, assumed or added; empty where the model is the file's own.
+    drives_stated : whether a joint without an actuator has none; a URDF does not say.
     """
 
     name: str
@@ -54,8 +60,9 @@ class Robot:
     configure: Callable[[Robot, Log], Robot] | None = None
     priors: Mapping[str, str] = field(default_factory=dict)
     fields: Mapping[str, type[Term]] = field(default_factory=dict)
-    at: tuple[tuple[str, float], ...] = ()
+    at: tuple[Position, ...] = ()
     remarks: tuple[str, ...] = ()
+    drives_stated: bool = True
 
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import facts_html
@@ -124,7 +131,7 @@ def robot_from_file(path: Path) -> Robot:
             f"model {path}: this is not an XML file, so it is neither MJCF nor URDF. Give the robot's model with "
             "--model, and a log with --log"
         )
-    urdf = read_urdf(path, content) if is_urdf(content) else None
+    urdf = read_urdf(path, content)
 
     def make_spec() -> mujoco.MjSpec:
         if urdf is None:
@@ -145,7 +152,8 @@ def robot_from_file(path: Path) -> Robot:
             "(python -m mujoco.viewer --mjcf=FILE), meshes and included files beside it"
         ) from error
     remarks = () if urdf is None else urdf.remarks
-    return Robot(name=path.stem, make_spec=make_spec, path=path, digest=_digest(content), remarks=remarks)
+    stated = urdf is None
+    return Robot(path.stem, make_spec, path, _digest(content), remarks=remarks, drives_stated=stated)
 
 
 def robot_from_spec(name: str, make_spec: Callable[[], mujoco.MjSpec], **known: object) -> Robot:

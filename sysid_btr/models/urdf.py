@@ -32,16 +32,8 @@ class Urdf:
     remarks: tuple[str, ...]
 
 
-def is_urdf(content: bytes) -> bool:
-    """Whether an XML text is a URDF, by its outermost element."""
-    try:
-        return ElementTree.fromstring(content).tag == "robot"
-    except ElementTree.ParseError:
-        return False
-
-
-def read_urdf(path: Path, content: bytes) -> Urdf:
-    """A URDF without what is not there.
+def read_urdf(path: Path, content: bytes) -> Urdf | None:
+    """A URDF without what is not there; None for another XML text, by its outermost element.
 
     Shapes whose mesh is missing are left out: inertias are stated beside them. A mesh of a ROS package is looked for
     in the folders around the file.
@@ -51,7 +43,12 @@ def read_urdf(path: Path, content: bytes) -> Urdf:
     ModelError
         Elements that stand twice in one place and differ; with all of them.
     """
-    root = ElementTree.fromstring(content)
+    try:
+        root = ElementTree.fromstring(content)
+    except ElementTree.ParseError:
+        return None
+    if root.tag != "robot":
+        return None
     remarks = [*_without_repeats(path, root), *_with_found_meshes(path, root), *_with_inertias(root)]
     return Urdf(ElementTree.tostring(root, encoding="unicode"), tuple(remarks))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.models.commands import commanded
-from sysid_btr.models.pose import standing
+from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.compiling import compile_model, made_elsewhere, make_index
 from sysid_btr.simulation.grid import Grid, at_samples, make_grid, step_inputs
@@ -99,9 +99,8 @@ class Replay:
     @cached_property
     def start(self) -> tuple[FloatArray, FloatArray]:
         """Initial positions and velocities of the joints, (j,) each."""
-        joints, at = self.index.joints, standing(self.robot, self.log)
-        defaults = np.array([at.get(j, q) for j, q in zip(joints, self.model.qpos0[self.index.qpos], strict=True)])
-        start = initial_state(self.log, joints, defaults)
+        joints = self.index.joints
+        start = initial_state(self.log, joints, resting(self.robot, self.log, joints))
         unlogged = np.array([not self.log.has("position", joint) for joint in joints], dtype=bool)
         return coupled_state(self.model, self.index, *start, unlogged)
 
