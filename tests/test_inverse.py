@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 
 from sysid_btr.cli.commands import run
-from sysid_btr.diagnosis.close import close
-from sysid_btr.errors import ModelError, UsageError
+from sysid_btr.diagnosis.close import close, usable_effects
+from sysid_btr.errors import LogError, ModelError, UsageError
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.noise import channel_noise
 from sysid_btr.io.parquet import read_log, write_log
+from sysid_btr.models.actuation import with_motors
 from sysid_btr.models.robot import Robot, robot_from_file
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.coupling import DriveCoupling
+from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.scales import JointScale
 
 ARM = """<mujoco><compiler angle="radian"/><option timestep="0.001"/>
@@ -203,8 +205,22 @@ def test_what_a_mode_cannot_do_is_said(arm: Robot) -> None:
     still = replace(log, channels={n: v for n, v in log.channels.items() if not n.startswith("effort")})
     with pytest.raises(ModelError, match=r"no effort .*--mode forward"):
         make_study(arm, [still], mode=Mode("inverse"))
+    rest = replace(log, channels={n: v if n.startswith("effort") else 0 * v for n, v in log.channels.items()})
+    with pytest.raises(LogError, match=r"no joint with a torque moves between 0 and"):
+        close(study_of(arm, rest), ["mass:hand"])
     with pytest.raises(UsageError, match="choose one of auto, forward"):
         Mode("backwards")
+
+
+def test_what_no_single_sample_shows_is_refused_and_not_looked_for(arm: Robot) -> None:
+    """Play and compliance need a second joint, hysteresis a past: torques of one instant know neither."""
+    study = study_of(with_motors(arm), moved())
+    for name in ("backlash", "joint_compliance"):
+        with pytest.raises(UsageError, match=rf"{name}: .* --mode forward"):
+            study.declare([f"{name}:elbow"])
+    sought = {effect.name for effect in usable_effects(select_effects(("all",)), study)}
+    assert "coulomb_friction" in sought
+    assert not sought & {"backlash", "joint_compliance"}
 
 
 def test_a_log_without_commands_is_fitted_from_the_shell(

@@ -88,7 +88,7 @@ def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[
     """Effects that these logs could show at all, given mount and channels."""
     floating = any(episode.procedure.leaves_ground_error for episode in study.train)
     result = []
-    for effect in effects:
+    for effect in filter(study.shows, effects):
         if effect.needs == GROUND and not floating:
             continue
         if effect.needs == "effort" and not any(episode.logged(("effort",)) for episode in study.train):

@@ -22,7 +22,7 @@ from sysid_btr.floating_base.segments import (
     whole_step,
 )
 from sysid_btr.identify.deferred import LEAST_GAIN
-from sysid_btr.identify.episode import E, Episode, Fused, Inflation, Procedure
+from sysid_btr.identify.episode import E, Episode, Fused, Procedure
 from sysid_btr.identify.initial_states import update_initial_states
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import holdout_split
@@ -151,16 +151,7 @@ class FloatingEpisode(Episode):
             robot, self.log, tuple(terms), numerics, effort, threads, segments=self.segments, base=self.base
         )
 
-    def compare(
-        self,
-        terms: Terms,
-        channels: Sequence[str],
-        numerics: Numerics,
-        *,
-        inflation: Inflation | None = None,
-        threads: int = 0,
-    ) -> Comparison:
-        plain = super().compare(terms, channels, numerics, inflation=inflation, threads=threads)
+    def completed(self, plain: Comparison) -> Comparison:
         return replace(plain, marginal=self.marginal, stretch=self.base.size.time(BLOCK))
 
     def shortened(self, seconds: float) -> FloatingEpisode:

@@ -81,6 +81,7 @@ class Procedure:
     tolerated : chi2 of fitted data up to which the model counts as right: noise floors are read from logs.
     replayed : whether its commands are replayed at all.
     no_torque : why the missing torque cannot be characterised, where it cannot.
+    unseen : why a term that it does not show changes nothing, and the way out.
     """
 
     demand: ClassVar[int] = 0
@@ -97,6 +98,11 @@ class Procedure:
     tolerated: ClassVar[float] = 1.5
     replayed: ClassVar[bool] = True
     no_torque: ClassVar[str] = "the replay fails or is too short"
+    unseen: ClassVar[str] = ""
+
+    def shows(self, term: type[Term]) -> bool:
+        """Whether a term of this class changes what is compared."""
+        return True
 
     def coarse(self, numerics: Numerics) -> Numerics:
         """Integrator and step that are good enough for first fits, and for derivatives by the initial states."""
@@ -215,7 +221,11 @@ class Episode(ABC):
             raise ModelError(f"log {log.path or ''}: none of the channels {', '.join(channels)} can be compared")
         inside = self.compared[:, None]
         inflated = (_with_noise(target, log.meta.mount, inflation or {}) for target in targets)
-        return Comparison(replay, tuple(replace(t, mask=t.mask & inside) for t in inflated))
+        return self.completed(Comparison(replay, tuple(replace(t, mask=t.mask & inside) for t in inflated)))
+
+    def completed(self, plain: Comparison) -> Comparison:
+        """A comparison with what else is known of an episode of this kind."""
+        return plain
 
     def predicts_torque(self, replay: Replay) -> BoolArray:
         """(j,) joints of a replay whose torque is predicted: those with a drive that is not given its torque."""

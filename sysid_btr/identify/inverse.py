@@ -9,20 +9,20 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.errors import ModelError
-from sysid_btr.identify.episode import Episode, Inflation, Procedure
+from sysid_btr.errors import LogError, ModelError
+from sysid_btr.identify.episode import Episode, Procedure
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import NoiseFloor, channel_noise
 from sysid_btr.io.split import holdout_split
+from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.simulation.compiling import make_index
-from sysid_btr.simulation.inverse import InverseReplay
+from sysid_btr.simulation.inverse import InverseReplay, needs_history
 from sysid_btr.simulation.kinematics import Kinematics, low_pass, smooth, uniform
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Outputs, Term
-from sysid_btr.terms.model import Terms
 
 _CASED = {"EULER": "Euler", "RK4": "RK4"}
 DRAWS = 4
@@ -36,6 +36,14 @@ class InverseProcedure(Procedure):
     moves_split: ClassVar[bool] = False
     replayed: ClassVar[bool] = False
     no_torque: ClassVar[str] = "too little of it moves"
+    unseen: ClassVar[str] = (
+        "torques are compared sample by sample with those of the measured motion, in which this changes nothing. "
+        "Leave it out, or replay commands: --mode forward"
+    )
+
+    def shows(self, term: type[Term]) -> bool:
+        """Samples are compared one by one: what needs a past, or a joint of its own, does nothing there."""
+        return not needs_history(term)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +82,10 @@ class InverseEpisode(Episode):
                 f"log {log.path or ''}: inverse dynamics compare torques, and it has no effort of the model's joints. "
                 "Log effort.<joint> (Nm or N), or replay its commands: --mode forward"
             )
-        model = robot.for_log(log).model
-        index = make_index(model)
+        configured = robot.for_log(log)
+        index = make_index(configured.model)
         sigma = np.array([_sigma(log, f"position.{joint}") for joint in index.joints])
-        motion = smooth(log, index.joints, model.qpos0[index.qpos], sigma)
+        motion = smooth(log, index.joints, resting(configured, log, index.joints), sigma)
         _, period, raw = uniform(log, tuple(f"effort.{j}" for j in torques))
         together = round(motion.period / period)
         effort = low_pass(raw, motion.cutoff, period)[::together]
@@ -133,16 +141,7 @@ class InverseEpisode(Episode):
             kinematics=self.kinematics.rows(0, len(log)),
         )
 
-    def compare(
-        self,
-        terms: Terms,
-        channels: Sequence[str],
-        numerics: Numerics,
-        *,
-        inflation: Inflation | None = None,
-        threads: int = 0,
-    ) -> Comparison:
-        plain = super().compare(terms, channels, numerics, inflation=inflation, threads=threads)
+    def completed(self, plain: Comparison) -> Comparison:
         moving = self.kinematics.moving[: len(self.log)]
         targets = []
         for target in plain.targets:
@@ -153,6 +152,13 @@ class InverseEpisode(Episode):
             inflated = target.sigma / target.noise
             mask = target.mask & moving[:, target.columns]
             targets.append(replace(target, floor=floor, sigma=noise * inflated, mask=mask))
+        if not any(target.mask.any() for target in targets):
+            end = float(self.log.time[-1] - self.log.time[0])
+            raise LogError(
+                f"log {self.log.path or ''}: no joint with a torque moves between {self.begin:.3g} and {end:.3g} s, "
+                "and torques of joints that stand still are not compared: dry friction takes any value in them. Give "
+                "a part of the log in which they move"
+            )
         return replace(plain, targets=tuple(targets))
 
     def torque_at_hand(self, outputs: Outputs) -> FloatArray:
@@ -200,7 +206,7 @@ class InverseEpisode(Episode):
             for i, joint in enumerate(replay.index.joints):
                 if log.has("position", joint):
                     channels[f"position.{joint}"] = channels[f"position.{joint}"] + sigma[i] * rng.normal(size=len(log))
-            start = replay.model.qpos0[replay.index.qpos]
+            start = resting(replay.robot, log, replay.index.joints)
             noisy = smooth(replace(log, channels=channels), replay.index.joints, start, sigma, self.kinematics.band)
             error = _efforts(replace(replay, kinematics=noisy)) - right
             square += np.mean(error**2, axis=0) / DRAWS

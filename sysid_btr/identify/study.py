@@ -76,8 +76,22 @@ class Study:
         return measure_scales(self.robot, self.train, self.numerics, self.threads)
 
     def declare(self, expressions: Sequence[str]) -> Terms:
-        """Terms of the parameters that a user frees."""
-        return Terms(parse_parameters(expressions, self.robot, self.scales))
+        """Terms of the parameters that a user frees.
+
+        Raises
+        ------
+        UsageError
+            If one is wrong, or changes nothing in these episodes as they are compared.
+        """
+        terms = Terms(parse_parameters(expressions, self.robot, self.scales))
+        idle = dict.fromkeys(term.called for term in terms if not self.shows(type(term)))
+        if idle:
+            raise UsageError(f"{', '.join(idle)}: {self.procedure.unseen}")
+        return terms
+
+    def shows(self, term: type[Term]) -> bool:
+        """Whether a term of this class changes what any episode is compared by, see `Procedure.shows`."""
+        return any(episode.procedure.shows(term) for episode in (*self.train, *self.holdout))
 
     def train_problem(self, model: Model | Iterable[Term]) -> ReplayProblem:
         """What is fitted, by a search that begins at a model; bare terms begin at their nominal values."""

@@ -107,18 +107,9 @@ def _make_targets(log: Log, joints: tuple[str, ...], channels: tuple[str, ...], 
         mask = np.isfinite(measured) & (time >= min(warm_up, 0.1 * time[-1]))[:, None]
         if channel == "effort":
             mask[-1] = False  # the replay ends here: the command of this sample is not replayed
-        live = mask.any(axis=0)
-        targets.append(
-            Target(
-                channel=channel,
-                joints=tuple(n for n, keep in zip(names, live, strict=True) if keep),
-                columns=np.array([joints.index(n) for n in names], dtype=np.int64)[live],
-                measured=measured[:, live],
-                floor=tuple(f for f, keep in zip(floor, live, strict=True) if keep),
-                sigma=np.array([f.sigma for f in floor])[live],
-                mask=mask[:, live],
-            )
-        )
+        columns = np.array([joints.index(n) for n in names], dtype=np.int64)
+        sigma = np.array([f.sigma for f in floor])
+        targets.append(Target(channel, names, columns, measured, floor, sigma, mask).only(mask.any(axis=0)))
     if not targets and log.is_motion:
         raise ModelError(
             f"log {log.path or ''} is an excitation trajectory, not a recording: it has only commands, and nothing to "
