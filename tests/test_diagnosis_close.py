@@ -18,7 +18,9 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, where_something_is
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.trials import attempt
+from sysid_btr.errors import LogError
 from sysid_btr.estimators import Journal
+from sysid_btr.identify.fit import fit
 from sysid_btr.identify.refit import judge
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import make_study
@@ -129,6 +131,19 @@ def pendulum_log(parameters: dict[str, float], seconds: float = 3.0) -> Log:
     run = replay_log(toys.pendulum(), motion, parameters, numerics=Numerics("RK4", 0.00125))
     measured = run.channels["position.arm"] + np.random.default_rng(1).normal(0.0, 4e-4, len(run))
     return replace(motion, channels={**motion.channels, "position.arm": measured})
+
+
+def test_white_noise_is_not_a_log_in_which_nothing_is_missing() -> None:
+    """Its floor would be all of it: nothing moves; and where a motion should show, the floor is that of a sensor."""
+    motion, rng = toys.swing(seconds=10.0), np.random.default_rng(4)
+    for size in (0.4, 30.0):
+        noise = size * rng.normal(size=len(motion))
+        log = replace(motion, channels={**motion.channels, "position.arm": noise})
+        study = make_study(toys.pendulum(), [log], numerics=toys.FINE)
+        with pytest.raises(LogError, match=r"nothing moves in this log: position\.arm"):
+            close(study, ["kp:arm"])
+        misfit = fit(study, ["kp:arm"]).misfit
+        assert (misfit is not None and misfit.times_noise > 1e3) == (size < 1)
 
 
 def test_what_is_declared_as_a_rule_is_found_where_it_is_asked_for() -> None:

@@ -540,6 +540,44 @@ def test_dead_sensors(good_log: Log, check) -> None:
     assert set(problem.where.split("; ")) == {"effort.HeadYaw", "imu.gyro_x", "force.RFoot"}
 
 
+def test_positions_that_nobody_measured(good_log: Log, check) -> None:
+    """Noise alone, a copy of the command, encoder counts, another recording's: each is found and named."""
+    rng, command = np.random.default_rng(2), good_log.channels["command.HeadYaw"]
+    late = np.concatenate([command[:1], command[:-1]])
+    found = {
+        "position.noise": 0.3 * rng.normal(size=len(command)),
+        "position.copied": late,
+        "units.counts": np.round(2000 * good_log.channels["position.HeadYaw"]),
+    }
+    for code, position in found.items():
+        log = change(good_log, position__HeadYaw=position, velocity__HeadYaw=None)
+        (problem,) = [p for p in check(log) if p.code == code]
+        assert (problem.severity, problem.where) == ("error", "position.HeadYaw")
+    other = 0.3 * np.sin(11.7 * good_log.time + 1.0) + 1e-4 * rng.normal(size=len(command))
+    log = change(good_log, position__HeadYaw=other, velocity__HeadYaw=None)
+    assert only(check(log), "joint.unrelated", "warning").where == "HeadYaw"
+
+
+def test_noise_that_may_hide_the_motion_is_no_fault(good_log: Log, check) -> None:
+    """A joint that is held, and one that is commanded to move by a fraction of its sensor's noise."""
+    rng, n = np.random.default_rng(3), len(good_log)
+    for command in (np.zeros(n), 1e-3 * good_log.channels["command.HeadYaw"]):
+        position = 2e-3 * rng.normal(size=n)
+        log = change(good_log, command__HeadYaw=command, position__HeadYaw=position, velocity__HeadYaw=None)
+        assert check(log) == ()
+
+
+def test_too_few_samples_to_see_any_noise(good_log: Log, check) -> None:
+    assert "log.short" in {p.code for p in check(good_log.window(0, 5))}
+    assert "log.short" in {p.code for p in check(replace(good_log, episode=np.arange(len(good_log))))}
+
+
+@pytest.mark.parametrize("period", [4, 1e-12])
+def test_periods_that_no_servo_has(tmp_path: Path, good_log: Log, period: float) -> None:
+    path = write_raw(tmp_path / "log.parquet", raw_columns(good_log), {**META, "servo_period": period})
+    assert only(validate_file(path), "meta.servo_period").message.startswith(f"{json.dumps(period)} is not allowed")
+
+
 def test_dead_command_while_the_position_moves(good_log: Log, check) -> None:
     problem = only(check(change(good_log, command__HeadYaw=np.zeros(len(good_log)))), "command.dead", "warning")
     assert problem.where == "command.HeadYaw"
@@ -619,7 +657,7 @@ def test_position_before_its_command(good_log: Log, check) -> None:
 
 def test_an_ordinary_lag_is_no_problem(good_log: Log, check) -> None:
     for lag in (0.0, 0.05, 0.1, 0.2):
-        position = chirp(np.maximum(good_log.time - lag, 0))
+        position = 0.999 * chirp(np.maximum(good_log.time - lag, 0))
         log = change(
             good_log, command__HeadYaw=chirp(good_log.time), position__HeadYaw=position, velocity__HeadYaw=None
         )
@@ -648,14 +686,14 @@ def test_degrees(good_log: Log, check, channels: tuple[str, ...]) -> None:
 def test_small_degrees_against_the_range(good_log: Log, check) -> None:
     ranges = dict.fromkeys(JOINTS, (-0.6, 0.6))
     small = np.degrees(0.03 * np.sin(good_log.time))
-    log = change(good_log, command__HeadYaw=small, position__HeadYaw=small, velocity__HeadYaw=None)
+    log = change(good_log, command__HeadYaw=small, position__HeadYaw=0.999 * small, velocity__HeadYaw=None)
     problem = only(check(log, ranges=ranges), "units.degrees")
     assert "position.HeadYaw" in problem.where
 
 
 def test_a_joint_that_really_turns(good_log: Log, check) -> None:
     turning = 3.0 * good_log.time + np.sin(good_log.time)
-    log = change(good_log, command__HeadYaw=turning, position__HeadYaw=turning, velocity__HeadYaw=None)
+    log = change(good_log, command__HeadYaw=turning, position__HeadYaw=0.999 * turning, velocity__HeadYaw=None)
     problem = only(check(log), "units.degrees")
     assert '{"command.HeadYaw": "rad"}' in problem.remedy
     units = {"command.HeadYaw": "rad", "position.HeadYaw": "rad"}

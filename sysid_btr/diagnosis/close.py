@@ -17,10 +17,13 @@ from sysid_btr.diagnosis.selection import STANDARD, Selection
 from sysid_btr.diagnosis.split import later_split
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.verdict import conclude, verdict_of
+from sysid_btr.errors import LogError
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import Study
+from sysid_btr.io._text import some
+from sysid_btr.io.noise import is_white
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import GROUND, Effect
 from sysid_btr.terms.library import select_effects
@@ -69,6 +72,7 @@ def close(
     """
     began = perf_counter()
     asked = select_effects(effects)
+    require_motion(study)
     while True:
         first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
         state = State.of(first, journal)
@@ -82,6 +86,23 @@ def close(
         # what is missing shows only after the fitted part: fit more of the log, hold out what is left
         study = replace(later, numerics=first.study.numerics, inflation={})
         journal = later.journal and later.journal.section()
+
+
+def require_motion(study: Study) -> None:
+    """Refuse logs that hold no motion: whatever the model does, nothing in them would speak against it.
+
+    Raises
+    ------
+    LogError
+        If every column that is fitted is constant, or noise alone.
+    """
+    problem = study.train_problem(())
+    if all(is_white(t.measured[t.mask[:, k], k]) for _, t, k in problem.columns):
+        names = dict.fromkeys(f"{t.channel}.{t.joints[k]}" for _, t, k in problem.columns)
+        raise LogError(
+            f"nothing moves in this log: {some(names, 6)} hold constant values or noise alone, in which no effect "
+            "would show. Record a motion (`sysid-btr excite` designs one)"
+        )
 
 
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:

@@ -20,8 +20,9 @@ from sysid_btr.estimators.base import ResidualEstimator
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
+from sysid_btr.io.noise import assumed_floor, hides_motion
 from sysid_btr.io.split import holdout_split
-from sysid_btr.models.commands import driven_by_effort
+from sysid_btr.models.commands import commanded, driven_by_effort
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
@@ -213,6 +214,7 @@ class Episode(ABC):
         log, present = self.log, self.logged(channels)
         replay = self.replay(terms, numerics, effort="effort" in present, threads=threads)
         targets = make_targets(log, replay.index.joints, present, self.warm_up)
+        targets = tuple(_doubting(target, replay) for target in targets)
         predicted = self.predicts_torque(replay)
         if not predicted.all():
             targets = tuple(t.only(predicted[t.columns]) if t.channel == "effort" else t for t in targets)
@@ -280,6 +282,20 @@ class Episode(ABC):
     def facts(self) -> Mapping[str, Any] | None:
         """What a result says about how it was segmented, and what its base state lacks; None where it is not."""
         return None
+
+
+def _doubting(target: Target, replay: Replay) -> Target:
+    """A target whose floors do not take a position for noise that hides the motion which its servo was commanded."""
+    if target.channel != "position":
+        return target
+    commands, servo = commanded(replay.log, replay.robot.model), replay.index.driven_by("position")
+    floor = list(target.floor)
+    for k, joint in enumerate(target.joints):
+        if floor[k].method != "high-frequency" or not servo[target.columns[k]] or not commands.has("command", joint):
+            continue
+        if hides_motion(target.measured[:, k], commands.channels[f"command.{joint}"]):
+            floor[k] = assumed_floor(target.measured[:, k])
+    return replace(target, floor=tuple(floor), sigma=np.array([f.sigma for f in floor]))
 
 
 def _with_noise(target: Target, mount: str, inflation: Inflation) -> Target:

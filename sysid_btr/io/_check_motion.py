@@ -11,6 +11,7 @@ from sysid_btr.io._check_units import is_linear
 from sysid_btr.io._text import at, by_channel, mirror_name, runs, some, spread
 from sysid_btr.io._tracking import Tracking, best_lag, driven, moves
 from sysid_btr.io.log import Log
+from sysid_btr.io.noise import hides_motion
 from sysid_btr.io.problem import Problem
 
 _MOVES_RAD = 0.02
@@ -18,6 +19,9 @@ _MOVES_M = 0.001
 _MAX_LAG = 0.25  # s
 _SEARCHED_LAG = 2.0  # s
 _STUCK_FOR = 0.3  # s
+_UNRELATED = 0.3
+"""Correlation with the command, at any lag, below which a position does not follow it. Positions of servos have 0.8 and
+more, of one that carries a heavy load or stands against a stop for half of the time about 0.5."""
 
 
 def _threshold(log: Log, joint: str) -> float:
@@ -52,7 +56,9 @@ def check_motion(log: Log, tracking: Mapping[str, Tracking], kinds: Mapping[str,
             "negate the column that does not follow the model's joint axis",
         )
     yield from _stuck(log, positions)
-    yield from _late(log, {j: t for j, t in tracking.items() if j not in explained and j not in flipped})
+    left = {j: t for j, t in tracking.items() if j not in explained and j not in flipped}
+    yield from _late(log, left)
+    yield from _unrelated(log, left)
     yield from _dead(log, positions)
     yield from _clipped_sensors(log)
 
@@ -130,6 +136,25 @@ def _late(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
             f"{text}: command and position seem to come from different clocks",
             f"if they were started apart: --shift command={worst:.2f}; if the robot moves to each target over a set "
             "time, log the interpolated command instead",
+        )
+
+
+def _unrelated(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
+    found = []
+    for joint, pair in tracking.items():
+        threshold, within = _threshold(log, joint), min(_SEARCHED_LAG, len(pair.command) * pair.step / 4)
+        if not (moves(pair, threshold) and spread(pair.position[pair.valid]) > threshold):
+            continue
+        alone = hides_motion(log.channels[f"position.{joint}"], log.channels[f"command.{joint}"])
+        if not alone and abs(best_lag(pair, -within, within)[1]) < _UNRELATED:
+            found.append(joint)
+    if found:
+        yield Problem(
+            "joint.unrelated",
+            "warning",
+            some(found),
+            "the position moves, and at no lag as the command does",
+            "check that both columns are of this joint and of one recording; if its servo was off, log `enabled`",
         )
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 DRIVES = ("position", "velocity", "torque", "mixed", "none")
+SERVO_PERIODS = (1e-5, 0.5)
+"""s, shortest and longest period of a servo's control law."""
 METADATA_KEY = b"sysid_btr"
 _MAGIC = b"PAR1"
 TEXT, UNKNOWN = "a text or CSV file", "something else"
@@ -202,9 +204,15 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
         accept(key, isinstance(raw.get(key), str), "text")
     accept("mount", raw.get("mount") in ("fixed", "free"), '"fixed" (the torso was fixed) or "free"')
     accept("command_hold", raw.get("command_hold") in ("zoh", "linear"), '"zoh" or "linear"')
+    period, servo = raw.get("sample_period"), raw.get("servo_period")
+    accept("sample_period", period is None or _positive(period), "a positive number of seconds")
+    quick, slow = SERVO_PERIODS
+    accept(
+        "servo_period",
+        servo is None or (_positive(servo) and quick <= servo <= slow),
+        f"seconds from {quick:g} to {slow:g}: control laws of servos run at 2 Hz to 100 kHz",
+    )
     for key in ("sample_period", "servo_period"):
-        value = raw.get(key)
-        accept(key, value is None or _positive(value), "a positive number of seconds")
         if known.get(key) is not None:
             known[key] = float(known[key])
     accept("drive", raw.get("drive") in DRIVES, ", ".join(f'"{name}"' for name in DRIVES))
@@ -253,13 +261,18 @@ def _misspelled_keys(extra: Iterable[str], raw: Mapping[str, Any]) -> Iterator[P
 
 def _numbers(value: object) -> bool:
     """Whether it is a table of finite numbers."""
-    return isinstance(value, dict) and all(
-        isinstance(n, (int, float)) and not isinstance(n, bool) and math.isfinite(n) for n in value.values()
-    )
+    return isinstance(value, dict) and all(map(_finite, value.values()))
 
 
-def _positive(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+def _positive(value: object) -> TypeGuard[float]:
+    return _finite(value) and value > 0
+
+
+def _finite(value: object) -> TypeGuard[float]:
+    """Whether it is a number that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 # --- columns ------------------------------------------------------------------------------------------------

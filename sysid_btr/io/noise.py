@@ -31,6 +31,8 @@ FINEST_BITS = 24
 ASSUMED_BITS = 20
 """Resolution that is assumed of one whose noise was filtered away: that of a good encoder, so that nothing real hides
 below it."""
+WHITE = 3.0
+"""Standard errors of the first autocorrelation up to which samples count as independent."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +80,49 @@ def noise_floor(values: FloatArray) -> NoiseFloor:
         most = max(CLIP * spread, 2 * step * gain / sqrt(6))
         estimates.append(float(np.sqrt(np.mean(np.minimum(moving, most) ** 2))) / gain)
     sigma = min(estimates) if estimates else 0.0
-    reach = float(np.ptp(finite))
-    if max(sigma, step / sqrt(12)) < reach * 2.0**-FINEST_BITS:
-        return NoiseFloor(reach * 2.0**-ASSUMED_BITS / sqrt(12), "assumed", step)
+    if max(sigma, step / sqrt(12)) < float(np.ptp(finite)) * 2.0**-FINEST_BITS:
+        return assumed_floor(values)
     if sigma <= step / sqrt(12):
         return NoiseFloor(max(step / sqrt(12), 1e-12), "quantisation", step)
     return NoiseFloor(sigma, "high-frequency", step)
+
+
+def assumed_floor(values: FloatArray) -> NoiseFloor:
+    """Noise of a good sensor over the range of its values, where these say nothing of it."""
+    finite = values[np.isfinite(values)]
+    reach = float(np.ptp(finite)) if len(finite) else 0.0
+    return NoiseFloor(max(reach * 2.0**-ASSUMED_BITS / sqrt(12), 1e-12), "assumed", quantisation_step(values))
+
+
+def is_white(values: FloatArray) -> bool:
+    """Whether no sample of a sensor (n,) says anything of the next: noise alone, or nothing at all.
+
+    By their first autocorrelation, whose standard error for white noise is one over the root of the number of pairs
+    (Bartlett 1946, doi:10.2307/2983611).
+    """
+    return _persistence(values)[0] <= WHITE * _persistence(values)[1]
+
+
+def hides_motion(values: FloatArray, motion: FloatArray) -> bool:
+    """Whether a sensor (n,) shows noise alone, though a motion (n,) that it should show would stand out of it."""
+    own, error = _persistence(values)
+    expected, _ = _persistence(motion)
+    finite = values[np.isfinite(values)]
+    if own > WHITE * error or not len(finite) > MIN_SAMPLES or not np.ptp(finite) > 0:
+        return False
+    share = min(float(np.nanvar(motion) / np.var(finite)), 1.0)
+    return bool(share * expected > 2 * WHITE * error)
+
+
+def _persistence(values: FloatArray) -> tuple[float, float]:
+    """First autocorrelation of samples, and its standard error where there is none."""
+    centred = values - np.nanmean(values) if np.isfinite(values).any() else values
+    products = centred[1:] * centred[:-1]
+    pairs = np.isfinite(products)
+    power = float(np.nanmean(centred**2)) if np.isfinite(centred).any() else 0.0
+    if not pairs.any() or not power > 0:
+        return 0.0, 1.0
+    return float(np.mean(products[pairs])) / power, 1 / sqrt(int(pairs.sum()))
 
 
 def quantisation_step(values: FloatArray) -> float:

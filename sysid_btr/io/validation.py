@@ -9,6 +9,7 @@ from pathlib import Path
 from sysid_btr.io._check_clock import check_clock
 from sysid_btr.io._check_columns import check_columns
 from sysid_btr.io._check_motion import check_motion
+from sysid_btr.io._check_signal import check_signal
 from sysid_btr.io._check_units import check_declared_units, check_scale
 from sysid_btr.io._check_values import check_noise, check_values, plausible
 from sysid_btr.io._file import load
@@ -66,6 +67,7 @@ def validate_log(
         *check_declared_units(log),
         *check_scale(motion, tracking, ranges, kinds),
         *check_motion(motion, tracking, kinds),
+        *check_signal(motion, tracking),
     ]
     return worst_first(found)
 
