@@ -15,8 +15,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.blind.__main__ import named
 from benchmarks.blind.judge import Context, Judgement, judge
+from benchmarks.blind.run import named
 from reference_simulator.effects import Backlash, CommandDelay, CoulombFriction, Payload, SpeedTorqueLimit
 
 if TYPE_CHECKING:

@@ -6,13 +6,16 @@ beside this file.
 """
 
 from reference_simulator.effects import EFFECTS, parse_effect
+from reference_simulator.forms import FORMS
 from reference_simulator.motions import MOTIONS
-from reference_simulator.record import Recording, Sensors, exact_channels, record, save
+from reference_simulator.record import Follow, Recording, Sensors, exact_channels, record, save
 from reference_simulator.robot import load_robot
 
 __all__ = [
     "EFFECTS",
+    "FORMS",
     "MOTIONS",
+    "Follow",
     "Recording",
     "Sensors",
     "exact_channels",

@@ -62,14 +62,14 @@ class Effect:
         return place | {"parameters": parameters}
 
 
-def _only(assembly: Assembly, where: tuple[str, ...], value: float, elsewhere: float = 0.0) -> Array:
+def joint_array(assembly: Assembly, where: tuple[str, ...], value: float, elsewhere: float = 0.0) -> Array:
     """A joint array that is `value` at `where` and `elsewhere` otherwise."""
     out = np.full(assembly.robot.n, elsewhere)
     out[assembly.robot.indices(where)] = value
     return out
 
 
-def _columns(assembly: Assembly, where: tuple[str, ...], f: TimeSignal, elsewhere: float) -> TimeSignal:
+def joint_signal(assembly: Assembly, where: tuple[str, ...], f: TimeSignal, elsewhere: float) -> TimeSignal:
     """A scalar function of time as a (k, n) signal on the joints `where`."""
     joints, n = assembly.robot.indices(where), assembly.robot.n
 
@@ -93,7 +93,7 @@ class CoulombFriction(Effect):
 
     def attach(self, assembly: Assembly) -> None:
         robot = assembly.robot
-        loss = robot.frictionloss + _only(assembly, self.where, self.torque)
+        loss = robot.frictionloss + joint_array(assembly, self.where, self.torque)
         assembly.robot = replace(robot, frictionloss=loss)
 
 
@@ -106,7 +106,7 @@ class ViscousDamping(Effect):
 
     def attach(self, assembly: Assembly) -> None:
         robot = assembly.robot
-        assembly.robot = replace(robot, damping=robot.damping + _only(assembly, self.where, self.coefficient))
+        assembly.robot = replace(robot, damping=robot.damping + joint_array(assembly, self.where, self.coefficient))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,7 @@ class QuadraticDamping(Effect):
     name = "quadratic_damping"
 
     def attach(self, assembly: Assembly) -> None:
-        c = _only(assembly, self.where, self.coefficient)
+        c = joint_array(assembly, self.where, self.coefficient)
 
         def term(s: State) -> None:
             s.motor -= c * s.vm * np.abs(s.vm)
@@ -138,8 +138,8 @@ class StribeckFriction(Effect):
     name = "stribeck_friction"
 
     def attach(self, assembly: Assembly) -> None:
-        level = _only(assembly, self.where, self.coulomb)
-        peak = _only(assembly, self.where, self.static - self.coulomb)
+        level = joint_array(assembly, self.where, self.coulomb)
+        peak = joint_array(assembly, self.where, self.static - self.coulomb)
 
         def term(s: State) -> None:
             s.friction += level + peak * np.exp(-((s.vm / self.velocity) ** 2))
@@ -158,7 +158,7 @@ class LoadFriction(Effect):
     name = "load_friction"
 
     def attach(self, assembly: Assembly) -> None:
-        k = _only(assembly, self.where, self.coefficient)
+        k = joint_array(assembly, self.where, self.coefficient)
 
         def term(s: State) -> None:
             s.friction += k * np.abs(s.drive)
@@ -175,7 +175,7 @@ class Armature(Effect):
 
     def attach(self, assembly: Assembly) -> None:
         robot = assembly.robot
-        assembly.robot = replace(robot, armature=robot.armature + _only(assembly, self.where, self.inertia))
+        assembly.robot = replace(robot, armature=robot.armature + joint_array(assembly, self.where, self.inertia))
 
 
 # ---- time -----------------------------------------------------------------------------------------
@@ -211,16 +211,18 @@ class SensorDelay(Effect):
     name = "sensor_delay"
 
     def attach(self, assembly: Assembly) -> None:
-        late = _only(assembly, self.where, self.delay)
+        late = joint_array(assembly, self.where, self.delay)
         assembly.read_delay = late if assembly.read_delay is None else assembly.read_delay + late
 
 
 # ---- transmission ---------------------------------------------------------------------------------
 
 
-def _transmit(assembly: Assembly, where: tuple[str, ...], *values: float) -> None:
+def transmit(assembly: Assembly, where: tuple[str, ...], *values: float, smooth: bool = False) -> None:
+    """A transmission; `values` are half the play, stiffness, damping, restitution and the motor's share of damping."""
     joints = assembly.robot.indices(where)
-    assembly.transmissions.append(Transmission(joints, *(np.full(joints.size, x) for x in values)))
+    arrays = (np.full(joints.size, x) for x in values)
+    assembly.transmissions.append(Transmission(joints, *arrays, smooth=np.full(joints.size, smooth)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +242,7 @@ class Backlash(Effect):
 
     def attach(self, assembly: Assembly) -> None:
         half = 0.5 * self.play
-        _transmit(assembly, self.where, half, self.stiffness, 0.0, self.restitution, self.motor_damping)
+        transmit(assembly, self.where, half, self.stiffness, 0.0, self.restitution, self.motor_damping)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +258,7 @@ class JointCompliance(Effect):
     name = "joint_compliance"
 
     def attach(self, assembly: Assembly) -> None:
-        _transmit(assembly, self.where, 0.0, self.stiffness, self.damping, 0.0, self.motor_damping)
+        transmit(assembly, self.where, 0.0, self.stiffness, self.damping, 0.0, self.motor_damping)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +270,7 @@ class JointSpring(Effect):
     name = "joint_spring"
 
     def attach(self, assembly: Assembly) -> None:
-        k = _only(assembly, self.where, self.stiffness)
+        k = joint_array(assembly, self.where, self.stiffness)
 
         def term(s: State) -> None:
             s.link -= k * (s.q - self.rest)
@@ -291,7 +293,7 @@ class EncoderOffset(Effect):
     name = "encoder_offset"
 
     def attach(self, assembly: Assembly) -> None:
-        offset = _only(assembly, self.where, self.offset)
+        offset = joint_array(assembly, self.where, self.offset)
 
         def read(t: Array, q: Array, v: Array) -> None:
             q += offset
@@ -314,7 +316,7 @@ class EncoderScale(Effect):
     name = "encoder_scale"
 
     def attach(self, assembly: Assembly) -> None:
-        scale = _only(assembly, self.where, self.scale, 1.0)
+        scale = joint_array(assembly, self.where, self.scale, 1.0)
 
         def read(t: Array, q: Array, v: Array) -> None:
             q *= scale
@@ -338,7 +340,7 @@ class TorqueLimit(Effect):
     name = "torque_limit"
 
     def attach(self, assembly: Assembly) -> None:
-        limit = _only(assembly, self.where, self.limit, np.inf)
+        limit = joint_array(assembly, self.where, self.limit, np.inf)
 
         def term(s: State) -> None:
             np.clip(s.drive, -limit, limit, out=s.drive)
@@ -377,7 +379,7 @@ class SlewLimit(Effect):
     name = "slew_limit"
 
     def attach(self, assembly: Assembly) -> None:
-        assembly.slew.append(_only(assembly, self.where, self.rate, np.inf))
+        assembly.slew.append(joint_array(assembly, self.where, self.rate, np.inf))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -497,7 +499,7 @@ class ConstantForce(Effect):
     name = "constant_force"
 
     def attach(self, assembly: Assembly) -> None:
-        torque = _only(assembly, self.where, self.torque)
+        torque = joint_array(assembly, self.where, self.torque)
 
         def term(s: State) -> None:
             s.link += torque
@@ -515,7 +517,7 @@ class Cogging(Effect):
     name = "cogging"
 
     def attach(self, assembly: Assembly) -> None:
-        size = _only(assembly, self.where, self.amplitude)
+        size = joint_array(assembly, self.where, self.amplitude)
 
         def term(s: State) -> None:
             s.motor += size * np.sin(self.periods * s.qm + self.phase)
@@ -542,7 +544,7 @@ class ExternalDisturbance(Effect):
         def pulse(t: Array) -> Array:
             return self.torque * _within(t, starts, self.duration)
 
-        assembly.torque.append(_columns(assembly, self.where, pulse, 0.0))
+        assembly.torque.append(joint_signal(assembly, self.where, pulse, 0.0))
         assembly.breaks.extend([*starts, *(starts + self.duration)])
 
 
@@ -590,7 +592,7 @@ class GainDrift(Effect):
         def factor(t: Array) -> Array:
             return 1.0 + self.depth * np.sin(2.0 * np.pi * t / self.period)
 
-        assembly.stiffening.append(_columns(assembly, self.where, factor, 1.0))
+        assembly.stiffening.append(joint_signal(assembly, self.where, factor, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -604,7 +606,7 @@ class FrictionPatch(Effect):
     in_library = False
 
     def attach(self, assembly: Assembly) -> None:
-        size = _only(assembly, self.where, self.torque)
+        size = joint_array(assembly, self.where, self.torque)
 
         def term(s: State) -> None:
             s.friction += size * np.exp(-(((s.qm - self.centre) / self.width) ** 2))
@@ -628,7 +630,7 @@ class ControllerDropout(Effect):
         def on(t: Array) -> Array:
             return 1.0 - _within(t, starts, self.duration)
 
-        assembly.gain.append(_columns(assembly, self.where, on, 1.0))
+        assembly.gain.append(joint_signal(assembly, self.where, on, 1.0))
         assembly.breaks.extend([*starts, *(starts + self.duration)])
 
 

@@ -51,6 +51,8 @@ class State:
 
 Term = Callable[[State], None]
 TimeSignal = Callable[["Array"], "Array"]
+Host = Callable[[int, "Array", "Array"], None]
+"""Called at a sample with its number, and q and v; writes the commands that `Assembly.command` gives from then on."""
 
 
 @dataclass
@@ -59,7 +61,8 @@ class Transmission:
 
     `damping` is linear (N m s/rad); `restitution` is the Hunt-Crossley factor (s/rad): damping in proportion
     to the elastic torque, so that torque is continuous when the gap closes. `motor_share` is the part of the
-    joint's own damping that acts on the motor; the rest acts on the link.
+    joint's own damping that acts on the motor; the rest acts on the link. Where `smooth`, the gap has no edges:
+    the torque is stiffness (x - h tanh(x / h)), h being half the play.
     """
 
     joints: NDArray[np.intp]
@@ -68,6 +71,7 @@ class Transmission:
     damping: Array
     restitution: Array
     motor_share: Array
+    smooth: NDArray[np.bool_]
 
 
 @dataclass
@@ -86,6 +90,8 @@ class Assembly:
     command: TimeSignal
     duration: float
     rng: np.random.Generator
+    host: Host | None = None  # gives the commands of motors, sample by sample
+    inputs: list[Term] = field(default_factory=list)  # change s.u
     friction: list[Term] = field(default_factory=list)  # add to s.friction
     drive: list[Term] = field(default_factory=list)  # change s.drive: servo terms
     gains: list[Term] = field(default_factory=list)  # scale s.drive
@@ -149,6 +155,8 @@ class Plant:
         self.data = self.model.createData()
         self.grid = refined(grid, self._substeps(start, grid))
         self.kp, self.kv = robot.kp, robot.kv
+        self.feed = robot.motors.astype(float) if robot.motors.any() else None
+        self.period = sample_period
         self.damping = robot.damping.copy()  # on the motor
         self.damping[g] *= self.gap.motor_share
         self.link_damping = robot.damping[g] - self.damping[g]
@@ -176,6 +184,7 @@ class Plant:
         self.held = np.zeros(n) if servo_period else None
         self.ticks = _ticks(self.grid, servo_period)
         self.samples = _ticks(self.grid, sample_period)
+        self.smooth = np.flatnonzero(self.gap.smooth) if self.gap.smooth.any() else None
         self.limited = bool(np.isfinite(robot.torque_limit).any())
 
     # ---- inputs -----------------------------------------------------------------------------------
@@ -194,6 +203,8 @@ class Plant:
 
         self.points = points
         self.command = np.ascontiguousarray(a.command(points.ravel()).reshape(shape))
+        if a.host is not None and a.slew:
+            raise ValueError("a set-point that is followed at a limited rate belongs to a position servo")
         for rate in a.slew:
             self.command = _slewed(self.command, t1 - t0, rate)
         self.torque = sample(a.torque, np.add)
@@ -230,6 +241,14 @@ class Plant:
         self.free = np.flatnonzero(~(self.stuck & ~geared))
         self.locked_rotors = np.flatnonzero(self.stuck[self.gap.joints])
 
+    def _told(self, k: int, fraction: float) -> None:
+        """The commands at the current point, into s.u."""
+        self.s.u = self._input(self.command, k, fraction)
+        if self.assembly.inputs:
+            self.s.u = self.s.u.copy()
+            for term in self.assembly.inputs:
+                term(self.s)
+
     def _drive(self, k: int, fraction: float) -> None:
         """The servo's torque at the current point, into s.drive."""
         s, a = self.s, self.assembly
@@ -243,6 +262,8 @@ class Plant:
         if self.kp_factor is not None:
             s.drive *= self._input(self.kp_factor, k, fraction)
         s.drive -= np.multiply(self.kv, s.vm, out=self.scratch)
+        if self.feed is not None:
+            s.drive += np.multiply(self.feed, s.u, out=self.scratch)
         for term in a.drive:
             term(s)
         if self.gain is not None:
@@ -258,7 +279,7 @@ class Plant:
     def _derivative(self, k: int, fraction: float, dy: Array) -> None:
         s, a, pin = self.s, self.assembly, self.pin
         s.t = float(self.points[k, 0] + fraction * (self.points[k, 2] - self.points[k, 0]))
-        s.u = self._input(self.command, k, fraction)
+        self._told(k, fraction)
         g = self.gap.joints
         if g.size:
             s.qm[:], s.vm[:] = s.q, s.v
@@ -303,7 +324,10 @@ class Plant:
         g, s = self.gap, self.s
         twist = self.theta - s.q[g.joints]
         rate = self.omega - s.v[g.joints]
-        elastic = g.stiffness * (twist - np.clip(twist, -g.half_play, g.half_play))
+        free = np.clip(twist, -g.half_play, g.half_play)
+        if self.smooth is not None:
+            free[self.smooth] = (g.half_play * np.tanh(twist / g.half_play))[self.smooth]
+        elastic = g.stiffness * (twist - free)
         damped = np.maximum(1.0 + g.restitution * rate * np.sign(elastic), 0.0)
         return elastic * damped + g.damping * rate
 
@@ -409,6 +433,10 @@ class Plant:
         q, v, effort = (np.zeros((grid.size, n)) for _ in range(3))
         for k in range(grid.size - 1):
             q[k], v[k] = self.y[:n], self.y[n : 2 * n]
+            if self.assembly.host is not None:
+                if self.samples[k]:
+                    self.assembly.host(round(grid[k] / self.period), q[k], v[k])
+                self.command[k] = self.assembly.command(self.points[k])
             if self.ticks[k]:
                 self.held = self._servo_torque(k)
             if self.samples[k]:
@@ -426,7 +454,7 @@ class Plant:
         s, g = self.s, self.gap.joints
         self.w[:] = self.y
         s.t = float(self.grid[k])
-        s.u = self._input(self.command, k, 0.0)
+        self._told(k, 0.0)
         if g.size:
             s.qm[:], s.vm[:] = s.q, s.v
             s.qm[g], s.vm[g] = self.theta, self.omega
@@ -442,7 +470,7 @@ def _merge(parts: list[Transmission]) -> Transmission:
     def cat(name: str) -> Array:
         return np.concatenate([getattr(p, name) for p in parts]) if parts else np.zeros(0)
 
-    names = ("half_play", "stiffness", "damping", "restitution", "motor_share")
+    names = ("half_play", "stiffness", "damping", "restitution", "motor_share", "smooth")
     return Transmission(joints, *(cat(name) for name in names))
 
 

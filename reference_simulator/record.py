@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reference_simulator.motions import MOTIONS
-from reference_simulator.plant import Assembly, Plant, Trajectory, step_grid
+from reference_simulator.motions import MOTIONS, home
+from reference_simulator.plant import Assembly, Host, Plant, Trajectory, step_grid
 from reference_simulator.robot import Robot, load_robot
 
 if TYPE_CHECKING:
@@ -51,13 +51,25 @@ class Sensors:
 
 
 @dataclass(frozen=True)
+class Follow:
+    """A controller on the host, which sends motors the torques that make them follow a motion.
+
+    At each sample kp (q* - q) + kd (v* - v): N m/rad and N m s/rad of all joints, held until the next.
+    """
+
+    kp: tuple[float, ...]
+    kd: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Recording:
     """Everything that makes a log: same recording, same versions, same numbers.
 
     `mass` scales bodies (inertia follows), `kp` and `kv` scale the servos' gains: one factor, or factors by
     name or glob. `commands` (k, n) overrides `motion`. `step` is the plant's, s; `servo_period` makes the
     servo digital (its torque is computed once a period and held); None leaves it continuous. `preroll` s are
-    spent at the first command before time 0. The robot starts at rest at its first command.
+    spent at the first command before time 0. The robot starts at rest at its first command, a joint with a motor
+    at zero; `follow` makes motors do what `motion` asks (`commands` are torques of theirs).
     """
 
     robot: str | Path
@@ -74,6 +86,7 @@ class Recording:
     step: float = 5.0e-4
     servo_period: float | None = None
     preroll: float = 0.0
+    follow: Follow | None = None
     notes: str = ""
 
 
@@ -116,6 +129,10 @@ def _measure(spec: Recording) -> tuple[Array, dict[str, Array], dict[str, Array]
     time: Array = np.arange(round(spec.seconds * spec.rate), dtype=np.float64) * period
     commands = _commands(spec, nominal, time, motion_rng)
     effects = tuple(effect.resolved(nominal) for effect in spec.effects)
+    start = np.where(robot.motors, home(robot), commands[0])
+    host = None
+    if spec.follow is not None and spec.commands is None:
+        commands, host = _following(spec.follow, robot, time, commands)
 
     def held(t: Array) -> Array:
         now = np.clip(np.floor(t / period + 1e-9).astype(int), 0, len(commands) - 1)
@@ -123,7 +140,7 @@ def _measure(spec: Recording) -> tuple[Array, dict[str, Array], dict[str, Array]
 
     first = -spec.preroll
     last = float(time[-1]) + spec.step  # one step past the last sample, whose effort belongs to its own command
-    assembly = Assembly(robot=robot, command=held, duration=last, rng=effect_rng, breaks=list(time))
+    assembly = Assembly(robot=robot, command=held, duration=last, rng=effect_rng, breaks=list(time), host=host)
     for effect in effects:
         effect.attach(assembly)
     late = assembly.read_delay
@@ -132,12 +149,26 @@ def _measure(spec: Recording) -> tuple[Array, dict[str, Array], dict[str, Array]
     if spec.servo_period:
         breaks.append(np.arange(0.0, last, spec.servo_period))
     grid = step_grid(first, last, spec.step, np.concatenate(breaks))
-    plant = Plant(assembly, start=commands[0], grid=grid, sample_period=period, servo_period=spec.servo_period)
+    plant = Plant(assembly, start=start, grid=grid, sample_period=period, servo_period=spec.servo_period)
     exact = _readings(spec.sensors, assembly, plant.run(), time, commands)
     channels = {name: value.copy() for name, value in exact.items()}
     for name, value in channels.items():
         _spoil(name, value, spec.sensors, noise_rng)
     return time, channels, exact, _truth(spec, nominal, robot, factors, effects)
+
+
+def _following(follow: Follow, robot: Robot, time: Array, motion: Array) -> tuple[Array, Host]:
+    """Commands (k, n), those of motors empty, and what writes them."""
+    commands, on = np.where(robot.motors, 0.0, motion), robot.motors
+    rate = np.gradient(motion, time, axis=0)
+    kp, kd = np.asarray(follow.kp), np.asarray(follow.kd)
+
+    def tell(sample: int, q: Array, v: Array) -> None:
+        now = min(max(sample, 0), len(commands) - 1)
+        torque = kp * (motion[now] - q) + kd * (rate[now] - v)
+        commands[now, on] = torque[on]
+
+    return commands, tell
 
 
 def _commands(spec: Recording, robot: Robot, time: Array, rng: np.random.Generator) -> Array:

@@ -59,8 +59,9 @@ def _point_inertia(mass: float, lever: Array) -> Array:
 class Robot:
     """What the recorder knows of a robot. Joint arrays have length n and the order of `joints`.
 
-    `kp` (N m/rad), `kv` (N m s/rad) belong to the position servo; `damping`, `armature`, `frictionloss`,
-    `stiffness`, `rest` are the joint's own; `torque_limit` is inf where the file sets none. SI units.
+    `kp` (N m/rad), `kv` (N m s/rad) belong to the position servo; `motors` are joints whose drive gives the torque
+    that is commanded (N m at the joint) instead; `damping`, `armature`, `frictionloss`, `stiffness`, `rest` are the
+    joint's own; `torque_limit` is inf where the file sets none. SI units.
     """
 
     name: str
@@ -74,6 +75,7 @@ class Robot:
     range: Array
     kp: Array
     kv: Array
+    motors: NDArray[np.bool_]
     damping: Array
     armature: Array
     frictionloss: Array
@@ -113,8 +115,8 @@ class Robot:
 def load_robot(source: str | Path) -> Robot:
     """Read an MJCF file, or one of the recorder's own robots by name (`six_joint_leg`, `pendulum`).
 
-    Raises ValueError for what the recorder cannot hold: free or ball joints, actuators that are not position
-    servos.
+    Raises ValueError for what the recorder cannot hold: free or ball joints, actuators that are neither position
+    servos nor motors.
     """
     import mujoco
 
@@ -130,15 +132,21 @@ def load_robot(source: str | Path) -> Robot:
         if m.jnt_type[j] not in (hinge, slide):
             raise ValueError(f"{path.name}: joint {m.joint(j).name!r} is neither hinge nor slide; hold the torso")
     kp, kv, limit = np.zeros(m.nv), np.zeros(m.nv), np.full(m.nv, np.inf)
+    motors = np.zeros(m.nv, dtype=bool)
     for a in range(m.nu):
         j = int(m.actuator_trnid[a, 0])
-        gain, bias = m.actuator_gainprm[a], m.actuator_biasprm[a]
-        simple = m.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT) and m.actuator_gear[a, 0] == 1.0
-        if not simple or bias[0] != 0.0 or bias[1] != -gain[0]:
-            raise ValueError(f"{path.name}: actuator {m.actuator(a).name!r} is not a position servo with gear 1")
-        kp[j], kv[j] = gain[0], -bias[2]
+        gain, bias, gear = m.actuator_gainprm[a], m.actuator_biasprm[a], float(m.actuator_gear[a, 0])
+        at_joint = m.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        motor = int(m.actuator_biastype[a]) == int(mujoco.mjtBias.mjBIAS_NONE)
+        servo = gear == 1.0 and bias[0] == 0.0 and bias[1] == -gain[0]
+        if not at_joint or not (motor or servo):
+            name = m.actuator(a).name
+            raise ValueError(f"{path.name}: actuator {name!r} is neither a position servo with gear 1 nor a motor")
+        motors[j] = motor
+        if servo:
+            kp[j], kv[j] = gain[0], -bias[2]
         if m.actuator_forcelimited[a]:
-            limit[j] = m.actuator_forcerange[a, 1]
+            limit[j] = m.actuator_forcerange[a, 1] * gear
     limits = m.jnt_range.copy()
     limits[(limits == 0.0).all(axis=1)] = [-1.0, 1.0]
     return Robot(
@@ -153,6 +161,7 @@ def load_robot(source: str | Path) -> Robot:
         range=limits,
         kp=kp,
         kv=kv,
+        motors=motors,
         damping=m.dof_damping.copy(),
         armature=m.dof_armature.copy(),
         frictionloss=m.dof_frictionloss.copy(),

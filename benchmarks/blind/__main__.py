@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import importlib
+import multiprocessing
+import os
 import pkgutil
 import subprocess
 import sys
-import traceback
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
 
 from benchmarks.blind.draw import PARTS, Case, draw
-from benchmarks.blind.judge import Context, Judgement, judge, signature_fits
+from benchmarks.blind.recorded import HERE, digest, identify, is_recorded, recipe_state
+from benchmarks.blind.run import Job, planted_text, say, work
 from benchmarks.blind.summary import latest, summarise
-from benchmarks.blind.table import Row, append, read_rows
-
-if TYPE_CHECKING:
-    from reference_simulator.effects import Effect
-
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
+from benchmarks.blind.table import read_rows
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,10 +26,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     if options.list:
         for case in _chosen(options):
-            print(f"{case.id:<12}{case.bench.name:<4} {case.spec.motion:<10}{_planted(case.spec.effects) or 'nothing'}")
+            planted = planted_text(case.spec.effects) or "nothing"
+            print(f"{case.id:<12}{case.bench.name:<16}{case.spec.motion:<10}{planted}")
         return 0
     if not options.summary:
         _run(options)
+    if options.record:
+        return 0
     rows = [r for r in latest(read_rows(options.out), options.code) if r.series == options.series]
     print(summarise(rows), end="")
     return 0
@@ -50,7 +48,9 @@ def _parser() -> argparse.ArgumentParser:
         "--series", type=int, default=0, help="another draw of everything, for logs that nobody has tuned on"
     )
     parser.add_argument("--out", type=Path, default=HERE / "results.csv", help="table to continue")
-    parser.add_argument("--threads", type=int, default=0, help="worker threads, 0 for all cores")
+    parser.add_argument("--threads", type=int, default=0, help="worker threads of each log, 0 for all cores")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="logs at a time, each in a process")
+    parser.add_argument("--record", action="store_true", help="only record logs, for a machine without Pinocchio")
     parser.add_argument("--again", action="store_true", help="also logs that the table has for this code")
     parser.add_argument("--list", action="store_true", help="show what would be planted, and stop")
     parser.add_argument("--summary", action="store_true", help="only sum up the table")
@@ -77,128 +77,40 @@ def _chosen(options: argparse.Namespace) -> list[Case]:
 
 
 def _run(options: argparse.Namespace) -> None:
-    code, recipe = code_state(), recipe_state()
-    done = set() if options.again else {row.key for row in read_rows(options.out)}
-    began, count = perf_counter(), 0
-    for part in _parts(options):
-        for number in _numbers(options, part):
-            if (_id(part, number, options.series), recipe, code) in done:
-                continue
-            if options.count is not None and count >= options.count:
-                return
-            if options.seconds_budget is not None and perf_counter() - began > options.seconds_budget:
-                return
-            case = draw(part, number, options.series)
-            row = examine(case, code, recipe, options.out, options.threads)
-            append(options.out, row)
-            count += 1
-            sys.stderr.write(
-                f"{row.id:<12}{row.robot:<4} {row.seconds:5.0f} s  {row.correct:<12}"
-                f"{row.planted or 'nothing'} -> {row.named or row.verdict}{f'  ({row.why})' if row.why else ''}\n"
-            )
-            sys.stderr.flush()
-
-
-def _id(part: str, number: int, series: int) -> str:
-    return f"{f'{series}/' if series else ''}{part}-{number:02d}"
-
-
-def examine(case: Case, code: str, recipe: str, out: Path, threads: int = 0) -> Row:
-    """Record, close, judge. A log is recorded once; `close` sees the Parquet file and nothing else."""
-    from reference_simulator import load_robot, save
-    from sysid_btr.diagnosis.close import close
-    from sysid_btr.identify.study import make_study
-    from sysid_btr.io.parquet import read_log
-    from sysid_btr.models.builtin import load_robot as load_model
-    from sysid_btr.result import to_json
-
-    path = HERE / "logs" / recipe / f"{case.id.replace('/', '_')}.parquet"
-    if not path.with_suffix(".truth.json").exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save(case.spec, path, overwrite=True)
-    kept = out.parent / "results" / f"{case.id.replace('/', '_')}.json"
-    kept.parent.mkdir(parents=True, exist_ok=True)
     began = perf_counter()
-    try:
-        study = make_study(load_model(str(case.bench.model)), [read_log(path)], threads=threads)
-        result = close(study, list(case.bench.fit)).to_dict()
-    except Exception:
-        text = traceback.format_exc()
-        sys.stderr.write(text)
-        kept.with_suffix(".error.txt").write_text(text)
-        failure = Judgement("error", text.strip().splitlines()[-1], float("nan"), 0, 0)
-        return _row(case, code, recipe, {}, failure, perf_counter() - began)
-    seconds = perf_counter() - began
-    kept.with_suffix(".error.txt").unlink(missing_ok=True)
-    kept.write_text(to_json(result))
-    context = Context(case.spec.sensors.effort, frozenset(case.bench.free))
-    judgement = judge(result, case.spec.effects, load_robot(case.bench.model).joints, context)
-    return _row(case, code, recipe, result, judgement, seconds)
+    jobs = _jobs(options)
+    if options.workers > 1:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes to come
+
+    def begin(job: Job) -> None:
+        if options.seconds_budget is not None and perf_counter() - began > options.seconds_budget:
+            return
+        if options.workers == 1:
+            work(job)
+            return
+        process = multiprocessing.get_context("spawn").Process(target=work, args=(job,))
+        process.start()
+        process.join()
+        if process.exitcode:
+            say(f"{identify(job.part, job.number, job.series)}: its process ended with {process.exitcode}")
+
+    with ThreadPoolExecutor(options.workers) as pool:
+        list(pool.map(begin, jobs))
 
 
-def _row(case: Case, code: str, recipe: str, result: dict[str, Any], found: Judgement, seconds: float) -> Row:
-    fits = signature_fits(case.spec.effects, result.get("signature"))
-    return Row(
-        id=case.id,
-        part=case.part,
-        series=case.series,
-        number=case.number,
-        code=code,
-        recipe=recipe,
-        robot=case.bench.name,
-        motion=case.spec.motion,
-        seed=case.spec.seed,
-        effort=int(case.spec.sensors.effort),
-        planted=_planted(case.spec.effects),
-        verdict=result.get("verdict", ""),
-        named="; ".join(named(e) for e in result.get("effects", ())),
-        correct=found.outcome,
-        why=found.why,
-        amplitude_error=_text(found.amplitude_error),
-        in_ci95=f"{found.inside}/{found.told}" if found.told else "",
-        chi2_before=_text(_chi2(result, "before")),
-        chi2_after=_text(_chi2(result, "after")),
-        signature=str((result.get("signature") or {}).get("summary", "")),
-        signature_fits="" if fits is None else ("yes" if fits else "no"),
-        seconds=round(seconds, 1),
-        replays=int(result.get("replays", 0)),
-    )
-
-
-def _chi2(result: dict[str, Any], when: str) -> float:
-    """Held-out chi2 over all channels that were fitted; each channel has as many samples."""
-    channels = result.get(when, {}).get("holdout", {})
-    known = [s["chi2"] for s in channels.values() if s["chi2"] is not None]
-    return sum(known) / len(known) if known else float("nan")
-
-
-def _text(value: float) -> str:
-    return "" if value != value else f"{value:.4g}"
-
-
-def _planted(effects: Sequence[Effect]) -> str:
-    return "; ".join(_placed(e.name, e.where, _sizes(e.truth()["parameters"])) for e in effects)
-
-
-def _sizes(parameters: dict[str, Any]) -> str:
-    def text(value: Any) -> str:
-        return "/".join(f"{v:.3g}" for v in value) if isinstance(value, list) else f"{value:.3g}"
-
-    return ",".join(f"{k}={text(v)}" for k, v in parameters.items())
-
-
-def named(entry: dict[str, Any]) -> str:
-    """One effect of a result: name, places, amounts, and what it may be confused with."""
-    labels = [p["name"].partition(":")[0].partition(".")[2] or "size" for p in entry["parameters"]]
-    values = [p["value"] for p in entry["parameters"]]
-    sizes = ",".join(f"{k}={v:.3g}" for k, v in list(zip(labels, values, strict=True))[:6])
-    other = f" or {'/'.join(entry['confused_with'])}" if entry["confused_with"] else ""
-    return _placed(entry["effect"], entry["where"], sizes) + other
-
-
-def _placed(name: str, where: Sequence[str], sizes: str) -> str:
-    place = ",".join(where) if len(where) < 6 else f"{len(where)} places"
-    return f"{name}@{place} {sizes}" if place else f"{name} {sizes}"
+def _jobs(options: argparse.Namespace) -> list[Job]:
+    """What the table (or the folder of logs) lacks."""
+    code = "" if options.record else code_state()
+    done = set() if options.again or options.record else {row.key for row in read_rows(options.out)}
+    threads = options.threads if options.workers == 1 else 1
+    jobs = [
+        Job(part, number, options.series, code, options.out, threads)
+        for part in _parts(options)
+        for number in _numbers(options, part)
+        if (identify(part, number, options.series), recipe_state(part), code) not in done
+        and not (options.record and is_recorded(part, number, options.series))
+    ]
+    return jobs[: options.count]
 
 
 def code_state() -> str:
@@ -217,20 +129,7 @@ def code_state() -> str:
     commit = git("rev-parse", "--short", "HEAD")
     changed = not commit or git("status", "--porcelain", "--", ".")
     name = f"{sysid_btr.__version__}-{commit}" if commit else sysid_btr.__version__
-    return f"{name}+{_digest(sorted(folder.rglob('*.py')))}" if changed else name
-
-
-def recipe_state() -> str:
-    """Digest of what makes the logs."""
-    sources = [HERE / "draw.py", HERE / "sizes.py", *sorted((ROOT / "reference_simulator").glob("*.py"))]
-    return _digest([*sources, ROOT / "sample_logs" / "nao.xml", ROOT / "sample_logs" / "leg.xml"])
-
-
-def _digest(files: Sequence[Path]) -> str:
-    whole = hashlib.sha256()
-    for file in files:
-        whole.update(file.read_bytes())
-    return whole.hexdigest()[:8]
+    return f"{name}+{digest(sorted(folder.rglob('*.py')))}" if changed else name
 
 
 if __name__ == "__main__":

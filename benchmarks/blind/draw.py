@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.blind.shapes import SHAPES
 from benchmarks.blind.sizes import ALIKE, LIBRARY, OUTSIDE, Recipe, Stage
-from reference_simulator import MOTIONS, Recording, Sensors, exact_channels, load_robot
+from reference_simulator import FORMS, MOTIONS, Follow, Recording, Sensors, exact_channels, load_robot
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
     Names = tuple[str, ...]
 
 SAMPLE_LOGS = Path(__file__).parents[2] / "sample_logs"
-PARTS: dict[str, int] = {"single": 60, "pair": 20, "outside": 10, "clean": 20}
+MODELS = Path(__file__).parent / "models"
+PARTS: dict[str, int] = {"single": 60, "pair": 20, "outside": 10, "clean": 20, "shape": 120}
 """Logs in each part."""
 VISIBLE = 2.0
 """What an effect must add to an exact sensor at each of its joints, in noise floors (rms over the log) ..."""
@@ -33,6 +35,8 @@ VISIBLE_EVERYWHERE, MOST = 1.5, 0.85
 TOO_MUCH = 0.12
 """Rms change of position (rad) beyond which the robot would have been repaired, not identified."""
 TRIES_A_MOTION = 6
+GIVE_UP = 3 * TRIES_A_MOTION
+"""Draws after which a log of forms takes other ones."""
 ROUGH = 2.0e-3
 """Step (s) of the recordings that only judge a draw."""
 NUDGE = 0.05
@@ -40,7 +44,11 @@ NUDGE = 0.05
 
 @dataclass(frozen=True)
 class Bench:
-    """One robot of the benchmark: the model, what is declared free, and where masses are wrong."""
+    """One robot of the benchmark: the model, what is declared free, and where masses are wrong.
+
+    With `follow` it has motors, which a controller on the host makes follow the motion; then a torque may well move
+    it by more than `too_much` (rad, rms) that would be repaired elsewhere.
+    """
 
     name: str
     model: Path
@@ -49,6 +57,8 @@ class Bench:
     free: Names
     wrong: Names
     loadable: Names
+    follow: Follow | None = None
+    too_much: float = TOO_MUCH
 
 
 BENCHES: dict[str, Bench] = {
@@ -73,7 +83,40 @@ BENCHES: dict[str, Bench] = {
         wrong=("HipPitch", "KneePitch"),
         loadable=("AnkleRoll", "KneePitch", "HipPitch"),
     ),
+    "torque_arm": Bench(
+        name="torque_arm",
+        model=MODELS / "torque_arm.xml",
+        seconds=15.0,
+        fit=("mass:elbow_link,wrist_link",),
+        free=("elbow_link", "wrist_link"),
+        wrong=("elbow_link", "wrist_link"),
+        loadable=("elbow_link", "wrist_link"),
+        follow=Follow((40.0, 10.0, 3.0), (4.0, 0.8, 0.2)),
+        too_much=0.4,
+    ),
+    "double_pendulum": Bench(
+        name="double_pendulum",
+        model=MODELS / "double_pendulum.xml",
+        seconds=15.0,
+        fit=("mass:upper_link,lower_link",),
+        free=("upper_link", "lower_link"),
+        wrong=("upper_link", "lower_link"),
+        loadable=("upper_link", "lower_link"),
+        follow=Follow((15.0, 5.0), (1.5, 0.35)),
+        too_much=0.4,
+    ),
+    "servo_arm": Bench(
+        name="servo_arm",
+        model=MODELS / "servo_arm.xml",
+        seconds=15.0,
+        fit=("mass:elbow_link,wrist_link", "kp:*=shared", "kv:*=shared"),
+        free=("elbow_link", "wrist_link"),
+        wrong=("elbow_link", "wrist_link"),
+        loadable=("elbow_link", "wrist_link"),
+    ),
 }
+OTHERS = ("torque_arm", "double_pendulum", "servo_arm")
+"""The robots of every third log of `shape`; the others are on the Nao and on the leg in turn."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +147,7 @@ class Case:
 def draw(part: str, number: int, series: int = 0) -> Case:
     """The log `number` (from 1) of a part; the same arguments give the same log."""
     rng = np.random.default_rng([20260, series, list(PARTS).index(part), number])
-    bench = BENCHES["nao" if _on_nao(part, number) else "leg"]
+    bench = BENCHES[_robot(part, number)]
     if part == "clean":
         return Case(series, part, number, bench, _clean(rng, bench, number), 1)
     names = _names(rng, part, number)
@@ -112,7 +155,9 @@ def draw(part: str, number: int, series: int = 0) -> Case:
     for _ in count():
         if draws > 40 * TRIES_A_MOTION:
             raise RuntimeError(f"{part} {number}: no draw of {', '.join(names)} shows on this robot")
-        recipes = [(LIBRARY | OUTSIDE)[name] for name in names]
+        if part == "shape" and draws % GIVE_UP == 0:
+            names = _forms(rng, bench, number, draws // GIVE_UP)
+        recipes = [(LIBRARY | OUTSIDE | SHAPES)[name] for name in names]
         effort = any(r.effort for r in recipes) and number % 2 == 0
         if part == "single":  # the second log of an effect lacks what the first has
             effort = recipes[0].effort and _round(number) % 2 == 0
@@ -121,7 +166,7 @@ def draw(part: str, number: int, series: int = 0) -> Case:
         for _ in range(TRIES_A_MOTION):
             draws += 1
             effects = _effects(rng, bench, recipes, view.stage)
-            if view.shows(effects):
+            if view.shows(effects, bench.too_much):
                 return Case(series, part, number, bench, replace(plain, effects=effects), draws)
     raise AssertionError
 
@@ -131,9 +176,11 @@ def cases(part: str, series: int = 0) -> Iterator[Case]:
     yield from (draw(part, number, series) for number in range(1, PARTS[part] + 1))
 
 
-def _on_nao(part: str, number: int) -> bool:
-    """Two in five; each effect gets its turn on either robot."""
-    return (number + _round(number)) % 5 in (0, 2)
+def _robot(part: str, number: int) -> str:
+    """Two in five are on the Nao; each effect gets its turn on either robot. Of the forms it is one in three."""
+    if part == "shape":
+        return ("nao", "leg", OTHERS[number // 3 % len(OTHERS)])[number % 3]
+    return "nao" if (number + _round(number)) % 5 in (0, 2) else "leg"
 
 
 def _round(number: int) -> int:
@@ -141,7 +188,22 @@ def _round(number: int) -> int:
     return (number - 1) // len(LIBRARY)
 
 
+def _forms(rng: Generator, bench: Bench, number: int, skipped: int) -> Names:
+    """One to three forms of different families: the one whose turn it is (or a later one), and others at random."""
+    fit = [n for n, r in SHAPES.items() if r.drive in ("", "servo" if bench.follow is None else "motor")]
+    names = [fit[(number - 1 + (number - 1) // len(fit) + skipped) % len(fit)]]
+    wanted = 1 + int(rng.choice(3, p=(0.55, 0.3, 0.15))) if skipped < 4 else 1
+    for name in (str(n) for n in rng.permutation(fit)):
+        families = {FORMS[n].family for n in names}
+        common = _motions([SHAPES[n] for n in (*names, name)])
+        if len(names) < wanted and FORMS[name].family not in families and common:
+            names.append(name)
+    return tuple(names)
+
+
 def _names(rng: Generator, part: str, number: int) -> Names:
+    if part == "shape":
+        return ()
     if part == "single":
         return (list(LIBRARY)[(number - 1) % len(LIBRARY)],)
     if part == "outside":
@@ -166,9 +228,10 @@ def _plain(rng: Generator, bench: Bench, motion: str, sensors: Sensors) -> Recor
         seed=int(rng.integers(1, 2**31)),
         seconds=bench.seconds,
         mass={str(b): round(float(rng.uniform(0.8, 1.25)), 3) for b in bodies},
-        kp=round(float(rng.uniform(0.85, 1.15)), 3),
-        kv=round(float(rng.uniform(0.85, 1.2)), 3) if rng.random() < 0.3 else 1.0,
+        kp=round(float(rng.uniform(0.85, 1.15)), 3) if bench.follow is None else 1.0,
+        kv=round(float(rng.uniform(0.85, 1.2)), 3) if bench.follow is None and rng.random() < 0.3 else 1.0,
         sensors=sensors,
+        follow=bench.follow,
     )
 
 
@@ -238,6 +301,7 @@ class View:
         rough = replace(plain, step=ROUGH)
         with_effort = replace(rough, sensors=replace(plain.sensors, effort=True))
         time, seen = exact_channels(with_effort)
+        rough = replace(rough, commands=_commands(seen, robot))
         position = np.column_stack([seen[f"position.{j}"] for j in robot.joints])
         torque = np.column_stack([seen[f"effort.{j}"] for j in robot.joints])
         speed = np.gradient(position, time, axis=0)
@@ -256,34 +320,38 @@ class View:
         columns = tuple(f"{kind}.{j}" for kind, _ in kinds for j in robot.joints)
         floor = np.concatenate([np.full(robot.n, size) for _, size in kinds])
         exact = np.column_stack([seen[c] for c in columns])
-        nudged = [
-            *(replace(rough, mass=_times(plain.mass, body)) for body in bench.free),
-            replace(rough, kp=float(plain.kp) * (1 + NUDGE)),  # type: ignore[arg-type]
-            replace(rough, kv=float(plain.kv) * (1 + NUDGE)),  # type: ignore[arg-type]
-        ]
-        changes = [((_table(spec, columns) - exact) / floor).ravel() for spec in nudged]
+        nudged = [*(replace(rough, mass=_times(plain.mass, body)) for body in bench.free)]
+        if bench.follow is None:
+            nudged.append(replace(rough, kp=float(plain.kp) * (1 + NUDGE)))  # type: ignore[arg-type]
+            nudged.append(replace(rough, kv=float(plain.kv) * (1 + NUDGE)))  # type: ignore[arg-type]
+        changes = [((_table(exact_channels(spec)[1], columns) - exact) / floor).ravel() for spec in nudged]
         left, size, _ = np.linalg.svd(np.column_stack(changes), full_matrices=False)
         return cls(plain, stage, columns, floor, exact, left[:, size > 1e-3 * size[0]])
 
-    def shows(self, effects: tuple[Effect, ...]) -> bool:
+    def shows(self, effects: tuple[Effect, ...], too_much: float = TOO_MUCH) -> bool:
         """Whether each effect shows beside the others, at each of its places, beyond what masses and gains do."""
         try:
-            whole = _table(replace(self.plain, effects=effects, step=ROUGH), self.columns)
+            _, seen = exact_channels(replace(self.plain, effects=effects, step=ROUGH))
+            whole = _table(seen, self.columns)
             for k, effect in enumerate(effects):
-                others = effects[:k] + effects[k + 1 :]
-                without = (
-                    _table(replace(self.plain, effects=others, step=ROUGH), self.columns) if others else self.exact
-                )
-                if not self._shows(effect, whole - without):
+                without = self._without(effects[:k] + effects[k + 1 :], seen)
+                if not self._shows(effect, whole - without, too_much):
                     return False
-        except FloatingPointError:  # the robot with this effect is unstable
+        except (FloatingPointError, np.linalg.LinAlgError):  # the robot with this effect is unstable
             return False
         return True
 
-    def _shows(self, effect: Effect, change: Array) -> bool:
+    def _without(self, others: tuple[Effect, ...], seen: Mapping[str, Array]) -> Array:
+        """What sensors see of the same commands with the other effects alone; a host sends others each time."""
+        if not others and self.plain.follow is None:
+            return self.exact
+        spec = replace(self.plain, effects=others, step=ROUGH, commands=_commands(seen, self.stage.robot))
+        return _table(exact_channels(spec)[1], self.columns)
+
+    def _shows(self, effect: Effect, change: Array, too_much: float) -> bool:
         robot = self.stage.robot
         raw = _rms(change)[: robot.n]
-        if raw.max() > TOO_MUCH:
+        if raw.max() > too_much:
             return False
         white = (change / self.floor).ravel()
         left = _rms((white - self.basis @ (self.basis.T @ white)).reshape(change.shape))
@@ -292,7 +360,7 @@ class View:
         if effect.acts_on == "body":
             return bool(strength.max() >= VISIBLE)
         if effect.acts_on == "robot" or effect.name == "voltage_sag":
-            return bool(np.sort(strength)[-2] >= VISIBLE)
+            return bool(np.sort(strength)[-2:].min() >= VISIBLE)
         own = strength[robot.indices(effect.where)]
         if own.size > 2:
             return bool(np.mean(own >= VISIBLE_EVERYWHERE) >= MOST)
@@ -305,8 +373,11 @@ def _times(mass: Mapping[str, float] | float, body: str) -> dict[str, float]:
     return table
 
 
-def _table(spec: Recording, columns: Names) -> Array:
-    _, seen = exact_channels(spec)
+def _commands(seen: Mapping[str, Array], robot: Robot) -> Array:
+    return np.column_stack([seen[f"command.{j}"] for j in robot.joints])
+
+
+def _table(seen: Mapping[str, Array], columns: Names) -> Array:
     return np.column_stack([seen[c] for c in columns])
 
 

@@ -14,7 +14,7 @@ from reference_simulator import effects as planted
 if TYPE_CHECKING:
     from reference_simulator.effects import Effect
 
-Outcome = Literal["yes", "ambiguous", "unexplained", "wrong", "missed", "error"]
+Outcome = Literal["yes", "ambiguous", "provisional", "unexplained", "wrong", "missed", "error"]
 EVERYWHERE, ALL_BUT = 6, 0.8
 """An effect planted at this many joints counts as found if this fraction of them, and no other, is named."""
 ROBOT_WIDE = frozenset({"voltage_sag", "gravity_tilt"})

@@ -61,6 +61,7 @@ class Recipe:
     everywhere : whether it may sit at all joints.
     scope : ``joint``, ``body``, ``robot``, or ``two`` joints.
     effort : whether a log of positions alone cannot tell it from something else: effort is logged half the time.
+    drive : ``servo`` or ``motor`` if it can only be on a robot with such drives.
     """
 
     draw: Draw
@@ -68,6 +69,7 @@ class Recipe:
     everywhere: bool = False
     scope: str = "joint"
     effort: bool = False
+    drive: str = ""
 
 
 def log_uniform(rng: Generator, low: float, high: float) -> float:
@@ -102,7 +104,7 @@ def _thermal(rng: Generator, stage: Stage, where: Names) -> Effect:
     return planted.ThermalDerating(where=where, alpha=alpha, time_constant=rng.uniform(4.0, 20.0))
 
 
-def _across(rng: Generator, stage: Stage, body: str, length: float) -> tuple[float, float, float]:
+def across(rng: Generator, stage: Stage, body: str, length: float) -> tuple[float, float, float]:
     """A random lever across the axis of the body's joint: along the axis it shows little or nothing."""
     axis = stage.robot.axes[stage.robot.body(body).joints[0]]
     direction = rng.normal(size=3)
@@ -112,12 +114,12 @@ def _across(rng: Generator, stage: Stage, body: str, length: float) -> tuple[flo
 
 
 def _payload(rng: Generator, stage: Stage, where: Names) -> Effect:
-    offset = _across(rng, stage, where[0], rng.uniform(0.03, 0.08))
+    offset = across(rng, stage, where[0], rng.uniform(0.03, 0.08))
     return planted.Payload(where=where, mass=rng.uniform(0.08, 0.3), offset=offset)
 
 
 def _com_offset(rng: Generator, stage: Stage, where: Names) -> Effect:
-    return planted.ComOffset(where=where, offset=_across(rng, stage, where[0], rng.uniform(0.01, 0.03)))
+    return planted.ComOffset(where=where, offset=across(rng, stage, where[0], rng.uniform(0.01, 0.03)))
 
 
 def _push(rng: Generator, stage: Stage, where: Names) -> Effect:

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from benchmarks.blind.draw import PARTS
 from benchmarks.blind.table import Row
 
-OUTCOMES = ("yes", "ambiguous", "unexplained", "missed", "wrong", "error")
+OUTCOMES = ("yes", "ambiguous", "provisional", "unexplained", "missed", "wrong", "error")
+MOSTLY_GONE = 0.7
+"""Share of the excess error."""
 
 
 def latest(rows: Sequence[Row], code: str | None = None) -> list[Row]:
@@ -38,7 +40,19 @@ def summarise(rows: Sequence[Row]) -> str:
             + "".join(f"{counts[o]:>12}" for o in OUTCOMES)
             + f"{sum(seconds) / len(seconds):>9.0f}{max(seconds):>7.0f}"
         )
-    lines += ["", *_targets(rows), "", *_amounts(rows), "", *_confusion(rows), "", *_failures(rows)]
+    lines += [
+        "",
+        *_targets(rows),
+        *_by_robot(rows),
+        "",
+        *_calibration(rows),
+        "",
+        *_amounts(rows),
+        "",
+        *_confusion(rows),
+        "",
+        *_failures(rows),
+    ]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -58,6 +72,7 @@ def _targets(rows: Sequence[Row]) -> list[str]:
         sign = "at most" if most else "at least"
         return f"{what:<40}{value:>4} of {done:<3} target {sign} {needed} of {PARTS[part]}: {state}"
 
+    gone = sum(r.part == "shape" and float(r.excess_gone or 0.0) >= MOSTLY_GONE for r in rows)
     improved = [r for r in rows if r.part == "clean" and _improvement(r) > 0.02]
     fits = sum(r.signature_fits == "yes" for r in rows if r.part == "outside")
     return [
@@ -68,6 +83,33 @@ def _targets(rows: Sequence[Row]) -> list[str]:
         target("outside", "outside the library: signature right", fits, 10),
         target("clean", "clean: nothing named", unnamed("clean"), 19),
         target("clean", "clean: held-out chi2 'improved' over 2 %", len(improved), 0, most=True),
+        target("shape", "other forms: families and places right", count("shape", "yes"), 108),
+        target("shape", "other forms: wrong, called explained", count("shape", "wrong", "error"), 2, most=True),
+        target("shape", "other forms: 70 % of the excess gone", gone, 108),
+    ]
+
+
+def _calibration(rows: Sequence[Row]) -> list[str]:
+    """How often names of a stated certainty are right (family and place)."""
+    stated = [t for r in rows for t in r.certainties.split(";") if t and not t.startswith("nan")]
+    lines = []
+    for low, high in ((0.0, 0.5), (0.5, 0.9), (0.9, 1.01)):
+        own = [t for t in stated if low <= float(t[:-1]) < high]
+        if own:
+            mean = sum(float(t[:-1]) for t in own) / len(own)
+            right = sum(t.endswith("+") for t in own)
+            lines.append(
+                f"certainty {mean:.2f} on average: {right} of {len(own)} right ({100 * right / len(own):.0f} %)"
+            )
+    return lines
+
+
+def _by_robot(rows: Sequence[Row]) -> list[str]:
+    shape = [r for r in rows if r.part == "shape"]
+    return [
+        f"other forms on {robot}: {sum(r.correct == 'yes' for r in own)} of {len(own)} right"
+        for robot in dict.fromkeys(r.robot for r in shape)
+        for own in ([r for r in shape if r.robot == robot],)
     ]
 
 
@@ -110,7 +152,7 @@ def _failures(rows: Sequence[Row]) -> list[str]:
     if not bad:
         return []
     return ["not right"] + [
-        f"  {r.id:<12}{r.robot:<4} {r.correct:<12}{r.planted or 'nothing'} -> {r.named or r.verdict}"
+        f"  {r.id:<12}{r.robot:<16} {r.correct:<12}{r.planted or 'nothing'} -> {r.named or r.verdict}"
         + (f" ({r.why})" if r.why else "")
         for r in bad
     ]

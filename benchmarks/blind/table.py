@@ -38,6 +38,10 @@ class Row:
     signature_fits: str
     seconds: float
     replays: int
+    family_correct: str = ""
+    families: str = ""
+    certainties: str = ""
+    excess_gone: str = ""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -45,6 +49,8 @@ class Row:
         return self.id, self.recipe, self.code
 
 
+NEWER = ("family_correct", "families", "certainties", "excess_gone")
+"""Columns that older tables do not have."""
 NUMBERS: dict[str, type[int] | type[float]] = {
     "series": int,
     "number": int,
@@ -68,7 +74,7 @@ def read_rows(path: Path) -> list[Row]:
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
         expected = [f.name for f in fields(Row)]
-        if reader.fieldnames != expected:
+        if list(reader.fieldnames or ()) not in (expected, expected[: -len(NEWER)]):
             raise ValueError(f"{path} has other columns than {', '.join(expected)}; move it away or give --out")
         return [Row(**{k: NUMBERS.get(k, str)(v) for k, v in line.items()}) for line in reader]  # type: ignore[arg-type]
 
