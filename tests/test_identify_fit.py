@@ -14,6 +14,9 @@ import pytest
 import toys
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.close import close
+from sysid_btr.display.text import exactness
+from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, Derived, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
@@ -105,6 +108,47 @@ def test_the_budget_bounds_all_searches_of_a_fit() -> None:
     assert cut.replays <= 20 + 10  # each search has to simulate where it begins, and its result is judged
     same = fit(study, free, budget=Budget(evaluations=whole.replays))
     assert same.values.tolist() == whole.values.tolist()
+
+
+# --- what is not fitted -----------------------------------------------------------------------------------
+
+
+LOADED = toys.PENDULUM.replace(
+    "</body>",
+    '<body name="load"><inertial pos="0 0 -0.2" mass="0.3" diaginertia="0.0024 0.0024 0.0024"/></body></body>',
+)
+"""A load at the arm's centre of mass, of three fifths of its mass and inertia: no motion distinguishes the two."""
+
+
+def test_intervals_hold_for_masses_that_are_not_fitted_where_these_may_be_off() -> None:
+    robot, motion = toys.robot_from_xml(LOADED), toys.swing(seconds=4.0)
+    for load in (0.85, 1.0, 1.15):
+        log = measured(robot, motion, {"mass:arm": 1.2, "mass:load": load})
+        study = make_study(robot, [log], numerics=toys.FINE)
+        exact = by_name(fit(study, ["mass:arm"]), "mass:arm")
+        assert exact.value == pytest.approx(1.2 + 0.6 * (load - 1), abs=0.005)
+        assert covers(exact, 1.2) == (load == 1.0)
+        found = fit(replace(study, nuisance={"mass": 0.1}), ["mass:arm"])
+        allowed = by_name(found, "mass:arm")
+        assert covers(allowed, 1.2)
+        assert allowed.value == exact.value
+        assert allowed.std == pytest.approx(np.hypot(0.06, exact.std), rel=0.02)
+    closed = close(found.study, ["mass:arm"], effects=("viscous_damping",))
+    assert closed.verdict == "nothing_missing"
+    assert closed.parameters[0].std == pytest.approx(allowed.std, rel=0.02)
+    assert found.to_dict()["taken_as_exact"] == []
+    assert "is off: mass by 0.1" in " ".join(exactness(found.to_dict()))
+
+
+def test_what_is_taken_as_exact_is_said() -> None:
+    study = make_study(toys.leg(), [measured(toys.leg(), toys.swing(toys.LEG_JOINTS))], numerics=toys.FINE)
+    result = fit(study, ["mass:knee"]).to_dict()
+    assert result["taken_as_exact"] == ["mass:hip", "mass:ankle"]
+    assert "the mass of hip, ankle (--nuisance mass=0.1" in " ".join(exactness(result))
+    with pytest.raises(
+        UsageError, match=r"--nuisance mass=0: a standard deviation is above zero\n.*did you mean 'mass'"
+    ):
+        make_study(toys.leg(), [measured(toys.leg(), toys.swing(toys.LEG_JOINTS))], nuisance={"mass": 0.0, "mas": 0.1})
 
 
 # --- covariance -------------------------------------------------------------------------------------------

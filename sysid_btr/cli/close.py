@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sysid_btr.cli.fitting import Run, generator
-from sysid_btr.cli.groups import FittingOptions
+from sysid_btr.cli.groups import FittingOptions, NuisanceOptions
 from sysid_btr.cli.inputs import find_robot, initial_values
 from sysid_btr.cli.kinds import Names
 from sysid_btr.cli.options import option
@@ -25,7 +25,7 @@ DECLARED = ("mass:*", "kp:*=shared", "kv:*=shared")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CloseOptions(FittingOptions):
+class CloseOptions(NuisanceOptions, FittingOptions):
     """Options of `close`."""
 
     effects: Names = option(("all",), "Effects that may be named.", metavar="all|NAME[,NAME..]", decides=True)
@@ -40,13 +40,16 @@ def close(options: CloseOptions) -> int:
     effect.
     """
     from sysid_btr.diagnosis.close import close as close_loop
+    from sysid_btr.identify.nuisance import check_nuisance
     from sysid_btr.terms.library import select_effects
 
     robot = find_robot(options, options.bounds)
     select_effects(options.effects)
+    check_nuisance(robot, options.nuisance)
     options = replace(options, fit=declared(robot, options.fit))
 
     def job(study: Study, journal: Journal, progress: ProgressLine) -> Closing:
+        study = replace(study, nuisance=options.nuisance)
         terms = study.declare(options.fit)
         return close_loop(
             study,

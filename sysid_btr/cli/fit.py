@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sysid_btr.cli.fitting import Run, generator, search_of
-from sysid_btr.cli.groups import SearchingOptions
+from sysid_btr.cli.groups import NuisanceOptions, SearchingOptions
 from sysid_btr.cli.inputs import check_freed, find_robot
 from sysid_btr.cli.options import option
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions(SearchingOptions):
+class FitOptions(NuisanceOptions, SearchingOptions):
     """Options of `fit`."""
 
     max_evaluations: int | None = option(
@@ -39,13 +39,16 @@ def fit(options: FitOptions) -> int:
     Exit 5 if the search did not converge or none of the parameters is identifiable; the results are written all the
     same.
     """
+    from sysid_btr.identify.nuisance import check_nuisance
     from sysid_btr.identify.profile import chosen_names, with_profiles
 
     robot = find_robot(options, options.bounds)
     check_freed(robot, options.fit)
+    check_nuisance(robot, options.nuisance)
     search = search_of(options, robot, options.max_evaluations)
 
     def job(study: Study, journal: Journal, progress: ProgressLine) -> Fit:
+        study = replace(study, nuisance=options.nuisance)
         terms = study.declare(options.fit)
         wanted = chosen_names(terms.names, options.profile)
         return with_profiles(search(study, terms, generator(options.seed), journal, progress), wanted, progress)

@@ -233,5 +233,17 @@ class FittingOptions(
 
 
 @dataclass(frozen=True, kw_only=True)
+class NuisanceOptions(Options):
+    """What is not fitted, and may be off."""
+
+    nuisance: Numbers = option(
+        {},
+        "Standard deviation of what is not fitted, e.g. mass=0.1 (10 %): intervals then do not take it as exact.",
+        metavar="NAME=STD",
+        decides=False,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SearchingOptions(FittingOptions, SearchOptions):
     """What `fit` and `posterior` have in common."""

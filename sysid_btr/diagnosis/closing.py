@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.nuisance import assumptions
 from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
@@ -127,4 +128,5 @@ class Closing(StudyOutcome):
             "candidates": [asdict(c) for c in self.candidates],
             "steps": [asdict(s) for s in self.steps],
             "signature": self.signature,
+            **assumptions(self.study, self.model.terms),
         }

@@ -11,6 +11,7 @@ from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.nuisance import error_of_the_rest
 from sysid_btr.identify.refit import judge, refit
 from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
 
@@ -31,12 +32,14 @@ def with_intervals(state: State, rules: Selection) -> State:
         else:  # what half the step changes in the derivatives is far less than what is known of them
             residual = problem.residuals(model.values[None])[0]
         shift, known = numerics_shift(problem, model.values, jacobian, residual), None
+        rest = error_of_the_rest(study, model, jacobian)
         fused = study.fuse(problem, model.values, jacobian, residual)
         if fused is not None:
             jacobian, residual = fused.jacobian, fused.residual
             shift, known = np.hypot(shift, fused.error), fused.known
             model = model.at(fused.values)
-        found = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks, shift, known)
+        beyond = np.hypot(shift, rest)
+        found = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks, beyond, known)
         bare = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks)
         clear = np.array([e.identifiable != "no" for e in bare])
         worst = np.max(np.abs(shift[clear]) / np.maximum([e.std for e in bare], 1e-300)[clear], initial=0.0)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 PLAIN_WIDTH = 118
 """Columns where the output is no terminal, so that what is piped does not depend on a window."""
-CANDIDATES_SHOWN = 6
+CANDIDATES_SHOWN, EXACT_SHOWN = 6, 4
 
 
 class Finding(Protocol):
@@ -71,6 +71,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     estimates = [*result.get("parameters", []), *(p for e in result.get("effects", []) for p in e["parameters"])]
     if estimates:
         yield parameters_table(estimates)
+        yield from map(Text, exactness(result))
         for p in estimates:
             if p["reason"]:
                 yield Text(f"  {p['name']}: {identifiability(p)}: {p['reason']}")
@@ -168,6 +169,22 @@ def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
             identifiability(p),
         )
     return table
+
+
+def exactness(result: Mapping[str, Any]) -> Iterator[str]:
+    """What intervals take as exact, and what they do not."""
+    exact, allowed = result.get("taken_as_exact"), result.get("nuisance")
+    if exact is None:
+        return
+    if allowed:
+        sizes = ", ".join(f"{name} by {number(std)}" for name, std in allowed.items())
+        yield f"intervals hold where what is not fitted is off: {sizes} (one standard deviation)"
+    else:
+        masses = [name.partition(":")[2] for name in exact]
+        shown = ", ".join(masses[:EXACT_SHOWN])
+        shown += f" and {len(masses) - EXACT_SHOWN} more" if len(masses) > EXACT_SHOWN else ""
+        among = f", among it the mass of {shown} (--nuisance mass=0.1: not known better than to 10 %)" if masses else ""
+        yield f"intervals take what is not fitted as exact{among}"
 
 
 def candidates_table(candidates: Sequence[Mapping[str, Any]]) -> Table:

@@ -20,6 +20,7 @@ from sysid_btr.identify.coarse import realise_servo, weigh_columns
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
+from sysid_btr.identify.nuisance import assumptions, error_of_the_rest
 from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Misfit, Scores, misfit_of, score
 from sysid_btr.identify.step_check import Optimum, with_short_steps
@@ -114,6 +115,7 @@ class Fit(StudyOutcome):
             "candidates": [],
             "steps": [],
             "signature": None,
+            **assumptions(self.study, self.model.terms),
             **({"profiles": [p.to_dict() for p in self.profiles]} if self.profiles else {}),
         }
 
@@ -180,7 +182,8 @@ def fit(
     if fused is not None:
         values, jacobian, residual = fused.values, fused.jacobian, fused.residual
         shift, known = np.hypot(shift, fused.error), fused.known
-    found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, shift, known)
+    beyond = np.hypot(shift, error_of_the_rest(study, problem.model.at(at.values), at.jacobian))
+    found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, beyond, known)
     if solved.by_residuals:
         values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))
         replays += spent

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -14,6 +14,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
 from sysid_btr.identify.mode import AUTOMATIC, Mode, episode_of, split_episode
+from sysid_btr.identify.nuisance import check_nuisance
 from sysid_btr.identify.segmented import measured_motion
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import split_episodes
@@ -50,6 +51,7 @@ class Study:
         column that the model cannot explain yet from distorting parameters about which others are informative. What is
         wrong about the ground is not an error of a robot that hangs.
     numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
+    nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, for the intervals.
     executor : where candidates are simulated.
     journal : record of refits, from which an interrupted search goes on; None keeps none.
     """
@@ -64,6 +66,7 @@ class Study:
     inflation: Inflation = field(default_factory=dict)
     executor: Executor = HERE
     journal: Journal | None = None
+    nuisance: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def leading_channel(self) -> str:
@@ -185,6 +188,7 @@ def make_study(
     mode: Mode = AUTOMATIC,
     threads: int = 0,
     executor: Executor = HERE,
+    nuisance: Mapping[str, float] | None = None,
 ) -> Study:
     """Lay out an identification.
 
@@ -199,6 +203,8 @@ def make_study(
     mode : how the logs are compared with the model.
     threads : worker threads, 0 for all cores.
     executor : where candidates are simulated: this process, or what `open_executor` gives.
+    nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, as
+        ``{"mass": 0.1}``: intervals then do not take them as exact.
 
     Raises
     ------
@@ -209,6 +215,7 @@ def make_study(
         log does not suit the mode.
     """
     require_drives(robot, logs)
+    check_nuisance(robot, nuisance or {})
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):
@@ -230,6 +237,7 @@ def make_study(
         numerics_error=np.nan,
         threads=threads,
         executor=executor,
+        nuisance=nuisance or {},
     )
     if numerics is None:
         leading = max(train, key=lambda e: e.procedure.demand)

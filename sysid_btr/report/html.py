@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.display.changes import model_lines
-from sysid_btr.display.text import compact, episode_words, identifiability, number, stages
+from sysid_btr.display.text import compact, episode_words, exactness, identifiability, number, stages
 from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
@@ -81,7 +81,15 @@ def _intervals(result: Mapping[str, Any]) -> str:
         f"residuals and the replay's own numerical error; {limit}",
         "excite": "Expected of a fit to a log of this motion (the Cramer-Rao bound), compared with the same for the "
         "reference motion.",
-    }.get(result["kind"], f"Intervals hold for correlated residuals and for the replay's own numerical error; {limit}")
+    }.get(
+        result["kind"],
+        " ".join(
+            (
+                f"Intervals hold for correlated residuals and for the replay's own numerical error; {limit}",
+                *(f"{words[0].upper()}{words[1:]}." for words in exactness(result)),
+            )
+        ),
+    )
 
 
 def _fitting(pictures: Sequence[Picture]) -> tuple[list[Picture], list[str]]:
