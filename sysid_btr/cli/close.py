@@ -40,12 +40,10 @@ def close(options: CloseOptions) -> int:
     effect.
     """
     from sysid_btr.diagnosis.close import close as close_loop
-    from sysid_btr.identify.nuisance import check_nuisance
     from sysid_btr.terms.library import select_effects
 
     robot = find_robot(options, options.bounds)
     select_effects(options.effects)
-    check_nuisance(robot, options.nuisance)
     options = replace(options, fit=declared(robot, options.fit))
 
     def job(study: Study, journal: Journal, progress: ProgressLine) -> Closing:

@@ -39,12 +39,10 @@ def fit(options: FitOptions) -> int:
     Exit 5 if the search did not converge or none of the parameters is identifiable; the results are written all the
     same.
     """
-    from sysid_btr.identify.nuisance import check_nuisance
     from sysid_btr.identify.profile import chosen_names, with_profiles
 
     robot = find_robot(options, options.bounds)
     check_freed(robot, options.fit)
-    check_nuisance(robot, options.nuisance)
     search = search_of(options, robot, options.max_evaluations)
 
     def job(study: Study, journal: Journal, progress: ProgressLine) -> Fit:

@@ -240,7 +240,7 @@ class NuisanceOptions(Options):
         {},
         "Standard deviation of what is not fitted, e.g. mass=0.1 (10 %): intervals then do not take it as exact.",
         metavar="NAME=STD",
-        decides=False,
+        decides=True,
     )
 
 

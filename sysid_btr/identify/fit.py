@@ -20,7 +20,7 @@ from sysid_btr.identify.coarse import realise_servo, weigh_columns
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
-from sysid_btr.identify.nuisance import assumptions, error_of_the_rest
+from sysid_btr.identify.nuisance import assumptions, check_nuisance, error_of_the_rest
 from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Misfit, Scores, misfit_of, score
 from sysid_btr.identify.step_check import Optimum, with_short_steps
@@ -157,6 +157,7 @@ def fit(
         Parameters that are not identifiable are fixed at their nominal value and marked.
     """
     began = perf_counter()
+    check_nuisance(study.robot, study.nuisance)
     terms = as_terms(study, parameters)
     if not terms.parameters:
         raise UsageError("nothing to fit: free at least one parameter, for example --fit 'mass:*'")

@@ -14,7 +14,6 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
 from sysid_btr.identify.mode import AUTOMATIC, Mode, episode_of, split_episode
-from sysid_btr.identify.nuisance import check_nuisance
 from sysid_btr.identify.segmented import measured_motion
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import split_episodes
@@ -215,7 +214,6 @@ def make_study(
         log does not suit the mode.
     """
     require_drives(robot, logs)
-    check_nuisance(robot, nuisance or {})
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):
