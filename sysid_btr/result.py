@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sysid_btr.errors import UsageError
+from sysid_btr.reading import parse_json
 from sysid_btr.version import __version__
 
 SCHEMA = "sysid_btr.result/1"
@@ -52,8 +53,10 @@ def clean(value: Any) -> Any:
         return float(value) if math.isfinite(value) else None
     if is_dataclass(value) and not isinstance(value, type):
         return clean(asdict(value))
-    if value is None or isinstance(value, str):
-        return value
+    if value is None:
+        return None
+    if isinstance(value, str):  # names of files may hold bytes that are no text
+        return value.encode("utf-8", "backslashreplace").decode("utf-8")
     raise TypeError(f"{type(value).__name__} cannot be part of a result: {value!r}")
 
 
@@ -74,7 +77,7 @@ def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
     if file.is_dir():
         file = file / "result.json"
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = parse_json(file.read_text(encoding="utf-8"))
     except OSError as error:
         began = (file.parent / "journal.jsonl").exists() or (file.parent / "journals").is_dir()
         todo = (

@@ -622,6 +622,21 @@ def test_a_bad_reply_is_answered_and_waited_for_again(tmp_path: Path) -> None:
     assert not (place / "problems.txt").exists()
 
 
+def test_a_reply_that_no_robot_can_have_given_is_refused(tmp_path: Path) -> None:
+    place = ask(tmp_path)
+    play(tmp_path)
+    reply, recorded = place / "outcome.json", read_log(place / "recorded.parquet", check=False)
+    reply.write_text('{"outcome": "done", "fitness": 1e308}')
+    ask(tmp_path)
+    assert "fitness is 1e+308" in (place / "problems.txt").read_text()
+    joint = f"command.{SPACE.joints[0]}"
+    other = {**recorded.channels, joint: 0.5 * np.sin(7 * recorded.time)}
+    write_log(replace(recorded, channels=other), place / "recorded.parquet", overwrite=True)
+    reply.write_text('{"outcome": "done", "fitness": 0.1}')
+    ask(tmp_path)
+    assert f"its commands of {SPACE.joints[0]} are not those of command.parquet" in (place / "problems.txt").read_text()
+
+
 def test_a_crash_needs_no_log(tmp_path: Path) -> None:
     place = ask(tmp_path)
     (place / "outcome.json").write_text('{"outcome": "crashed"}')

@@ -148,7 +148,7 @@ def test_what_is_taken_as_exact_is_said() -> None:
     with pytest.raises(
         UsageError, match=r"--nuisance mass=0: a standard deviation is above zero\n.*did you mean 'mass'"
     ):
-        make_study(toys.leg(), [measured(toys.leg(), toys.swing(toys.LEG_JOINTS))], nuisance={"mass": 0.0, "mas": 0.1})
+        fit(replace(study, nuisance={"mass": 0.0, "mas": 0.1}), ["mass:knee"])
 
 
 # --- covariance -------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from sysid_btr.errors import SysidError
 from sysid_btr.estimators.base import Budget, Progress, Termination, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot
+from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import Folder
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
@@ -73,7 +74,7 @@ def join_effects(
     """
     params = None if kept is None else kept.with_name(f"{kept.stem}_params.json")
     if kept is not None and params is not None and kept.exists():
-        return _read(json.loads(kept.read_text(encoding="utf-8")), params, stage.world.robot)
+        return _read(parse_json(kept.read_text(encoding="utf-8")), params, stage.world.robot)
     joined, study = _look(stage, values, tried, threads, progress)
     if kept is None or params is None:
         return joined

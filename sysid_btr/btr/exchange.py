@@ -23,10 +23,13 @@ from sysid_btr.btr.controllers import Controller, ControllerSpace
 from sysid_btr.btr.robot import OUTCOMES, Trial
 from sysid_btr.btr.task import Walk
 from sysid_btr.errors import InterruptedRun, LogError, UsageError
+from sysid_btr.io._text import some
 from sysid_btr.io.log import MOTION, Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.problem import errors_of
+from sysid_btr.io.resample import command_at
 from sysid_btr.io.validation import validate_log
+from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import Folder
 
 SCHEMA = "sysid_btr.exchange/1"
@@ -37,6 +40,11 @@ REQUEST, COMMAND, RECORDED, REPLY, PROBLEMS = (
     "outcome.json",
     "problems.txt",
 )
+FASTEST = 100.0
+"""m/s, beyond which a fitness is a mistake: three times as fast as any animal runs."""
+APART, LATE = 0.01, 0.5
+"""rad (m), and fraction of a command's standard deviation, by which what was played may differ from what was asked for:
+a recorder notes a command some samples late, and another motion of the same size is 1.4 deviations away."""
 SHORTEST = 0.9
 """Fraction of a trial that the recording of a run that did not fall must have."""
 
@@ -116,7 +124,7 @@ class FolderExchange:
         }
         if request.exists():
             try:
-                there = json.loads(request.read_text(encoding="utf-8"))
+                there = parse_json(request.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 raise UsageError(f"{request} cannot be read ({error}); restore it or clear --exchange") from None
             if there != content:
@@ -144,7 +152,7 @@ class FolderExchange:
     def _read(self, place: Path) -> tuple[Trial | None, list[str]]:
         """A reply, or all that is wrong with it."""
         try:
-            content: Any = json.loads((place / REPLY).read_text(encoding="utf-8"))
+            content: Any = parse_json((place / REPLY).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             return None, [f"{REPLY}: not JSON ({error})"]
         if not isinstance(content, dict) or content.get("outcome") not in OUTCOMES:
@@ -152,8 +160,10 @@ class FolderExchange:
         outcome = content["outcome"]
         fitness: Any = content.get("fitness", 0.0 if outcome == "crashed" else None)
         problems = []
-        if isinstance(fitness, bool) or not isinstance(fitness, int | float) or not np.isfinite(fitness):
-            problems.append(f"{REPLY}: fitness is {fitness!r}; expected the mean forward speed in m/s")
+        if isinstance(fitness, bool) or not isinstance(fitness, int | float) or not abs(fitness) <= FASTEST:
+            problems.append(
+                f"{REPLY}: fitness is {fitness!r}; expected the mean forward speed in m/s, {FASTEST:g} at most"
+            )
         log: Log | None = None
         if (place / RECORDED).exists() or outcome != "crashed":
             log, wrong = self._log(place / RECORDED, outcome)
@@ -168,6 +178,7 @@ class FolderExchange:
             return None, [str(error)]
         found = validate_log(log, joints=self.space.joints)
         problems = [f"{RECORDED}: {p.where}: {p.message}" for p in errors_of(found)]
+        problems += self._other_commands(path.with_name(COMMAND), log)
         missing = [j for j in self.space.joints if not log.has("position", j)]
         if missing:
             problems.append(f"{RECORDED}: no position of {', '.join(missing)}")
@@ -176,6 +187,20 @@ class FolderExchange:
             if seconds < SHORTEST * self.task.duration:
                 problems.append(f"{RECORDED}: {seconds:.2f} s of a trial of {self.task.duration:g} s that did not fall")
         return (None, problems) if problems else (log, [])
+
+    def _other_commands(self, asked: Path, played: Log) -> list[str]:
+        """Joints whose recorded commands are not those that were asked for."""
+        wanted = read_log(asked, check=False)
+        wrong = []
+        for joint in self.space.joints:
+            if not played.has("command", joint) or len(played) < 2:
+                continue
+            time = np.clip(played.time - played.time[0], 0.0, wanted.time[-1] - wanted.time[0])
+            own = command_at(wanted, (joint,), wanted.time[0] + time)[:, 0]
+            difference = played.channels[f"command.{joint}"] - own
+            if np.sqrt(np.nanmean(difference**2)) > APART + LATE * np.std(own):
+                wrong.append(joint)
+        return [f"{RECORDED}: its commands of {some(wrong)} are not those of {COMMAND}"] if wrong else []
 
 
 def _stamps(*paths: Path) -> tuple[float, ...]:

@@ -13,6 +13,7 @@ from sysid_btr.btr.controllers import Controller
 from sysid_btr.btr.robot import OUTCOMES, Robot, Trial
 from sysid_btr.errors import UsageError
 from sysid_btr.io.parquet import read_log, write_log
+from sysid_btr.reading import parse_json
 from sysid_btr.result import clean
 from sysid_btr.run_folder import Folder
 
@@ -93,7 +94,7 @@ class TrialBook:
         if not entry.exists():
             return None
         try:
-            content = json.loads(entry.read_text(encoding="utf-8"))
+            content = parse_json(entry.read_text(encoding="utf-8"))
             values = np.array(content["controller"], dtype=np.float64)
             fitness, outcome, logged = float(content["fitness"]), content["outcome"], bool(content["logged"])
         except (OSError, ValueError, KeyError, TypeError) as error:

@@ -30,6 +30,8 @@ KEPT = ("journals", "trials", "closings")
 """Folders of a run beside its results."""
 DURATIONS, LONG = {"ant": 3.0}, 8.0
 """s of a trial by robot, and of any other."""
+LONGEST = 3600.0
+"""s of a trial."""
 BY_FITNESS, BY_SENSORS = 12, 2
 """Trials of an iteration where models are judged by fitness, and where by sensors (the paper's m)."""
 
@@ -110,8 +112,8 @@ def btr(options: BtrOptions) -> int:
         raise UsageError("--resume continues from the journals of an earlier run: give its --out folder")
     space = get_space(model.name)
     duration = DURATIONS.get(model.name, LONG) if options.duration is None else options.duration
-    if not duration >= 1:
-        raise UsageError(f"--duration {duration:g}: a trial takes at least a second")
+    if not 1 <= duration <= LONGEST:
+        raise UsageError(f"--duration {duration:g}: a trial takes 1 to {LONGEST:g} s")
     task, settings = Walk(duration), settings_of(options, space)
     terms, robot = parse_parameters(options.fit, model), robot_of(options, model, task, space)
     folder = None if options.out is None else _open(options.out, options.resume, options.overwrite)

@@ -24,7 +24,7 @@ from sysid_btr.cli.posterior import posterior
 from sysid_btr.cli.replay import replay
 from sysid_btr.cli.report import report
 from sysid_btr.cli.study_file import read_study_file
-from sysid_btr.cli.terminal import remark
+from sysid_btr.cli.terminal import hang_up, open_streams, remark
 from sysid_btr.cli.validate import validate
 from sysid_btr.errors import InterruptedRun, SysidError, UsageError
 from sysid_btr.progress import Interrupted, interruptible
@@ -36,6 +36,8 @@ does not fit the log; 5 finished and written, but the fit did not converge or no
 """
 OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 """What the system says where something cannot be written."""
+UNREAD = 128 + 13
+"""Exit code where nobody reads the output, as a shell has it of a process that SIGPIPE ended."""
 STUDIED = (validate, replay, fit, posterior, close, btr, excite)
 """Verbs that take a study file."""
 VERBS: tuple[Callable[[Any], int], ...] = (
@@ -56,7 +58,17 @@ VERBS: tuple[Callable[[Any], int], ...] = (
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and end the process with its exit code."""
-    sys.exit(run(sys.argv[1:] if argv is None else argv))
+    open_streams()
+    try:
+        code = run(sys.argv[1:] if argv is None else argv)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read it has seen enough: `validate log | head -1`
+        hang_up()
+        code = UNREAD
+    except OSError as error:
+        hang_up()
+        code = _explain(error)
+    sys.exit(code)
 
 
 def run(argv: Sequence[str]) -> int:
@@ -65,6 +77,8 @@ def run(argv: Sequence[str]) -> int:
         with interruptible():
             app(list(argv), prog_name="sysid-btr")
     except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):
+            raise end.__context__ from None
         return end.code if isinstance(end.code, int) else 1
     except Interrupted:
         remark("interrupted")
@@ -75,6 +89,11 @@ def run(argv: Sequence[str]) -> int:
     except SysidError as error:
         remark(f"error: {error}")
         return error.exit_code
+    except BrokenPipeError:
+        raise
+    except MemoryError as error:
+        remark(f"error: there is not enough memory{f' ({error})' if str(error) else ''}: use fewer or shorter logs")
+        return UsageError.exit_code
     except Exception as error:
         if "--debug" in argv:
             raise

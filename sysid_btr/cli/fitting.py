@@ -111,9 +111,11 @@ class Run:
 
     def carry_out(self, job: Job) -> int:
         """Do the work, write and print what it found; the exit code."""
-        from sysid_btr.executors import open_executor
+        from sysid_btr.executors import caution, open_executor
         from sysid_btr.result import exit_code
 
+        if told := caution(self.options.executor):
+            remark(f"warning: {told}")
         began = time.perf_counter()
         with ProgressLine(self.verb) as progress, open_executor(self.options.executor) as executor:
             try:

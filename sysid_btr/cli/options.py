@@ -8,6 +8,7 @@ flag ``--max-evaluations`` for the field ``max_evaluations``, a study file the k
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
@@ -118,12 +119,14 @@ class Options:
     Raises
     ------
     UsageError
-        For a number that is less than is allowed.
+        For a number that is less than is allowed, or not finite.
     """
 
     def __post_init__(self) -> None:
         for one in options_of(type(self)).values():
             value = getattr(self, one.name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise UsageError(f"{one.flag} {value}: give a finite number")
             if one.least is not None and value is not None and value < one.least:
                 raise UsageError(f"{one.flag} {value}: give at least {one.least}")
 

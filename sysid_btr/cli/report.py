@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sysid_btr.cli.options import Options, argument
+from sysid_btr.errors import UsageError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,9 +19,20 @@ class ReportOptions(Options):
 
 def report(options: ReportOptions) -> int:
     """Write report.html again from result.json and the pictures of a finished run of any verb."""
+    from jinja2 import TemplateError
+
     from sysid_btr.report.pictures import write_report
     from sysid_btr.result import read_result
-    from sysid_btr.run_folder import Folder
+    from sysid_btr.run_folder import RESULT, Folder
 
-    sys.stdout.write(f"{write_report(Folder(options.folder), read_result(options.folder))}\n")
+    result = read_result(options.folder)
+    folder = options.folder if options.folder.is_dir() else options.folder.parent
+    try:
+        page = write_report(Folder(folder), result)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, TemplateError) as error:
+        raise UsageError(
+            f"{folder / RESULT} was changed and cannot be shown ({type(error).__name__}: {error}); give the "
+            "--out folder of a finished run as it was written"
+        ) from error
+    sys.stdout.write(f"{page}\n")
     return 0

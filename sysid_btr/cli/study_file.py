@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import difflib
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from sysid_btr.cli.options import Option
 from sysid_btr.errors import UsageError
+from sysid_btr.reading import parse_toml
 
 MAPPING = frozenset({"columns", "meta", "table", "time", "units"})
 """Sections that the mapping file of an import has, and a study file has not."""
@@ -34,11 +34,10 @@ def read_study_file(path: Path, known: Mapping[str, Option]) -> dict[str, Any]:
         If it cannot be read, is not TOML, or holds a key or value that no flag has; all of them at once.
     """
     try:
-        with path.open("rb") as file:
-            content = tomllib.load(file)
+        content = parse_toml(path.read_bytes())
     except OSError as error:
         raise UsageError(f"--config {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise UsageError(f"--config {path} is not TOML: {error}") from error
     content = {key.replace("-", "_"): value for key, value in content.items()}
     problems = [problem for key, value in content.items() for problem in _problems(key, value, known)]

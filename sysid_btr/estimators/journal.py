@@ -22,6 +22,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
+from sysid_btr.reading import parse_json
 
 SCHEMA = "sysid_btr.journal/2"
 _SYNC_PERIOD = 1.0  # s; a power cut loses at most the evaluations of this time
@@ -69,7 +70,9 @@ class Record:
         text, _, checksum = line.rpartition(b" ")
         if crc32(text) != int(checksum, 16):
             raise ValueError("the checksum is that of another text")
-        content = json.loads(text)
+        content = parse_json(text)
+        if len(content["arrays"]["loss"]) != len(content["candidates"]):
+            raise ValueError("every candidate has a loss")
         return cls(
             kind=str(content["kind"]),
             candidates=np.array(content["candidates"], dtype=np.float64),
@@ -304,7 +307,7 @@ class Journal:
 
     def _check_header(self, path: Path, line: bytes) -> None:
         try:
-            header = json.loads(line)
+            header = parse_json(line)
             schema, fingerprint = header["journal"], header["fingerprint"]
         except (ValueError, KeyError, TypeError):
             raise UsageError(f"{path} is not a journal of this program: give another path") from None

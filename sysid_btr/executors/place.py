@@ -67,6 +67,16 @@ def open_executor(place: str | None) -> Iterator[Executor]:
         yield executor
 
 
+def caution(place: str | None) -> str:
+    """What to know of a place before anything is sent there; empty where there is nothing."""
+    if place is None or not place.startswith("tcp://"):
+        return ""
+    return (
+        f"--executor {place}: problems travel as pickles, without encryption, and whoever reaches that port can run "
+        "code on its workers: keep it within a network that you trust, or use tls:// with certificates"
+    )
+
+
 def _local(place: str) -> int | None:
     """Workers of a cluster of our own; None if it is not one."""
     base, colon, number = place.partition(":")

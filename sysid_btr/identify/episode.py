@@ -26,7 +26,7 @@ from sysid_btr.models.commands import commanded, driven_by_effort
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
-from sysid_btr.objectives.targets import WARM_UP, Target, make_targets
+from sysid_btr.objectives.targets import COMPARED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Outputs, Term
@@ -212,6 +212,12 @@ class Episode(ABC):
             If there is nothing to compare.
         """
         log, present = self.log, self.logged(channels)
+        others = self.logged([c for c in COMPARED if c not in channels])
+        if others and not present:
+            raise ModelError(
+                f"log {log.path or ''}: it has no {' and no '.join(channels)} of the model's joints to compare; "
+                f"it has {', '.join(others)}: --channels {','.join(others)}"
+            )
         replay = self.replay(terms, numerics, effort="effort" in present, threads=threads)
         targets = make_targets(log, replay.index.joints, present, self.warm_up)
         targets = tuple(_doubting(target, replay) for target in targets)

@@ -12,15 +12,23 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.errors import LogError
 from sysid_btr.io.log import META_KEYS, SCHEMA_VERSION, Log, LogMeta, closest, is_schema_column
 from sysid_btr.io.problem import Problem
+from sysid_btr.memory import require_memory
+from sysid_btr.reading import parse_json
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
 DRIVES = ("position", "velocity", "torque", "mixed", "none")
 SERVO_PERIODS = (1e-5, 0.5)
 """s, shortest and longest period of a servo's control law."""
+EXACT = 2.0**53
+"""Up to which a float holds every whole number."""
+NUMBER, OBJECT = 8.0, 64.0
+"""Bytes of a float64, and of a Python object in a list."""
 METADATA_KEY = b"sysid_btr"
 _MAGIC = b"PAR1"
 TEXT, UNKNOWN = "a text or CSV file", "something else"
@@ -61,6 +69,8 @@ def load(path: str | Path) -> tuple[Log | None, tuple[Problem, ...]]:
         return None, (unreadable,)
     try:
         table = _read_table(path)
+    except LogError as error:
+        return None, (Problem("file.large", "error", str(path), str(error), "record fewer samples, or fewer columns"),)
     except (OSError, ValueError, NotImplementedError) as error:  # pyarrow's errors derive from these
         problem = Problem(
             "file.corrupt",
@@ -80,7 +90,16 @@ def _read_table(path: Path) -> pa.Table:
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path) as file:
+        require_memory(memory_of(file), f"{path}: its {file.metadata.num_rows} rows", "cut the log", LogError)
         return file.read()
+
+
+def memory_of(file: pq.ParquetFile) -> float:
+    """Bytes that a table takes once it is read: numbers as they are and as float64, anything else as objects."""
+    schema, rows = file.schema_arrow, float(file.metadata.num_rows)
+    cells = sum(2.0 * NUMBER if _is_numeric(field.type) else OBJECT for field in schema)
+    packed = sum(file.metadata.row_group(g).total_byte_size for g in range(file.metadata.num_row_groups))
+    return rows * cells + float(packed)
 
 
 def _one_line(error: Exception) -> str:
@@ -157,7 +176,7 @@ def _meta(metadata: Mapping[bytes, bytes], problems: list[Problem]) -> LogMeta:
         )
         return LogMeta()
     try:
-        raw = json.loads(metadata[METADATA_KEY])
+        raw = parse_json(metadata[METADATA_KEY])
     except ValueError as error:
         report("meta.json", "file metadata `sysid_btr`", f"not valid JSON ({error})", f"write e.g. {_EXAMPLE_META}")
         return LogMeta()
@@ -399,7 +418,7 @@ def _episode(columns: Mapping[str, pa.ChunkedArray], n: int, problems: list[Prob
         return np.zeros(n, dtype=np.int64)
     column = columns["episode"]
     values = _floats(column) if _is_numeric(column.type) else np.full(n, np.nan)
-    if not np.all(np.isfinite(values)) or np.any(values != np.round(values)):
+    if not np.all(np.abs(values) < EXACT) or np.any(values != np.round(values)):
         problems.append(
             Problem(
                 "episode.type",

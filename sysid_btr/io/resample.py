@@ -12,11 +12,10 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._clock import SNAP, gaps, holding_sample, typical_interval
 from sysid_btr.io.log import COMMANDS, Log
+from sysid_btr.memory import require_memory
 
 _SET_CHANNELS = ("enabled", "stiffness")
 """Channels that are set and stay, whatever the commands do."""
-
-_MAX_SAMPLES = 50_000_000
 
 
 def resample(log: Log, period: float) -> Log:
@@ -147,8 +146,9 @@ def _fill_forward(values: FloatArray) -> FloatArray:
 def _resample_episode(log: Log, period: float) -> Log:
     time = log.time
     duration = time[-1] - time[0]
-    if duration / period > _MAX_SAMPLES:
-        raise UsageError(f"resampling {duration:.6g} s every {period:.3g} s would give {duration / period:.2g} samples")
+    samples = duration / period
+    size = 8 * samples * (2 + len(log.channels) + len(log.unknown))
+    require_memory(size, f"resampling {duration:.6g} s every {period:.3g} s", "choose a longer period")
     # The end of the log counts as on the grid despite the rounding of its time stamp.
     interval = typical_interval(time)
     slack = 1e-6 + (SNAP * min(interval / period, 1.0) if len(log) > 1 else 0.0)

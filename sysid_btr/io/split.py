@@ -49,5 +49,17 @@ def holdout_split(log: Log, holdout: float = 0.3) -> tuple[Log, Log]:
 
 
 def split_episodes(log: Log) -> list[Log]:
-    """Each episode of a log as a log of its own."""
-    return [log.window(rows.start, rows.stop) for rows in log.episodes() if rows.stop - rows.start > 1]
+    """Each episode of a log as a log of its own; those of a single sample are left out.
+
+    Raises
+    ------
+    LogError
+        If none is left.
+    """
+    found = [log.window(rows.start, rows.stop) for rows in log.episodes() if rows.stop - rows.start > 1]
+    if not found:
+        raise LogError(
+            f"log {log.path or ''}: none of its {len(log.episodes())} episodes has two samples; leave `episode` out if "
+            "it numbers the samples"
+        )
+    return found

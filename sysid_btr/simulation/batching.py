@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.simulation.replay import CHUNK, CHUNK_DOFS, Replay
+from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import write_terms
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import BatchModel, Outputs
@@ -57,7 +57,7 @@ def batched_chunks(replays: Sequence[Replay], candidates: FloatArray) -> Iterato
             yield rows, (alone,)
         return
     candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
-    size = max(max(CHUNK, CHUNK_DOFS // max(replays[0].model.nv, 1)) // len(replays), 1)
+    size = max(min(replay.chunk_size for replay in replays) // len(replays), 1)
     for first in range(0, len(candidates), size):
         rows = slice(first, min(first + size, len(candidates)))
         with silenced():

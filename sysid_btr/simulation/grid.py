@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.interpolation import hermite
+from sysid_btr.memory import require_memory
 from sysid_btr.models.commands import FED_FORWARD
 
 if TYPE_CHECKING:
@@ -67,6 +68,10 @@ def make_grid(
     controls : actuators commanded by their own name, and the ctrl of those that the log does not command.
     """
     time = log.time - log.time[0]
+    # commands of joints and actuators at every step, and what it takes to find them
+    size = 8 * time[-1] / timestep * (4 + 3 * len(joints) + len(controls or {}))
+    what = f"replaying {time[-1]:.6g} s in steps of {timestep:.3g} s"
+    require_memory(size, what, "replay a part of the log, or take a longer step (servo_period of the log)")
     exact = time / timestep
     rounded = np.round(exact)
     aligned = np.abs(exact - rounded) < ALIGNED

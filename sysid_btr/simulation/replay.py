@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.memory import memory_limit, require_memory
 from sysid_btr.models.commands import commanded
 from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot
@@ -152,12 +153,29 @@ class Replay:
         candidates = np.atleast_2d(np.asarray(candidates, dtype=np.float64))
         if candidates.shape[1] != len(self.parameters):
             raise ValueError(f"candidates have {candidates.shape[1]} numbers, expected {len(self.parameters)}")
-        size = max(CHUNK, CHUNK_DOFS // max(self.model.nv, 1))
+        size = self.chunk_size
         for first in range(0, len(candidates), size):
             rows = slice(first, min(first + size, len(candidates)))
             with silenced():
                 outputs = self._run(candidates[rows])
             yield rows, outputs
+
+    @property
+    def chunk_size(self) -> int:
+        """Candidates that are simulated together, as memory allows.
+
+        Raises
+        ------
+        UsageError
+            If there is not enough for one.
+        """
+        seconds = float(self.log.time[-1] - self.log.time[0])
+        inputs = self.model.nu + 2 * len(self.index.joints)
+        one = 8 * (seconds / self.numerics.timestep * inputs + 6 * len(self.log) * len(self.index.joints))
+        what = f"simulating {seconds:.6g} s in steps of {self.numerics.timestep:.3g} s"
+        require_memory(one, what, "use a shorter log")
+        usual = max(CHUNK, CHUNK_DOFS // max(self.model.nv, 1))
+        return int(min(usual, max(memory_limit() / max(one, 1.0), 1.0)))
 
     def _values(self, candidates: FloatArray) -> list[tuple[Term, FloatArray]]:
         pairs, column = [], 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from sysid_btr.errors import UsageError
+from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import PARAMS
 from sysid_btr.terms.base import Parameter, Scope, Term
 from sysid_btr.terms.model import Model
@@ -52,7 +52,7 @@ def read_params(path: Path, robot: Robot) -> Params:
 
     file = path / PARAMS if path.is_dir() else path
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = parse_json(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"--params {file}: {error.strerror}; give the params.json of a finished run") from error
     except ValueError as error:

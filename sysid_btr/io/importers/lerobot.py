@@ -9,6 +9,7 @@ begin of the episode) are scalars. The format states no units: they are the robo
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +19,14 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import LogError
-from sysid_btr.io._file import load
+from sysid_btr.io._file import load, memory_of
 from sysid_btr.io._text import some
 from sysid_btr.io.importers.base import MappingNeeded, Recording, Signal
 from sysid_btr.io.importers.mapping import ImportMap
 from sysid_btr.io.log import LogMeta
 from sysid_btr.io.problem import explain
+from sysid_btr.memory import require_memory
+from sysid_btr.reading import parse_json
 
 INFO = Path("meta") / "info.json"
 STATE, ACTION = "observation.state", "action"
@@ -45,6 +48,10 @@ _SUFFIXES: Mapping[str, str] = {
 }
 _INDEX = ("timestamp", "frame_index", "episode_index", "index")
 _LISTS = ("motors", "axes")
+MOST = 10_000
+"""Entries of a list, at most: joints of a robot."""
+FASTEST = 1e6
+"""Frames a second, at most."""
 _TOLERANCE = 1e-3
 """s; stamps within it are frame / fps, rounded to float32."""
 
@@ -107,14 +114,17 @@ def _root(path: Path) -> Path | None:
 
 def _info(path: Path) -> dict[str, Any]:
     try:
-        info = json.loads((path / INFO).read_text(encoding="utf-8"))
+        info = parse_json((path / INFO).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise LogError(f"{path / INFO}: cannot be read ({error}); download or record the dataset again") from error
     fps = info.get("fps") if isinstance(info, dict) else None
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict) or not isinstance(fps, int | float):
         raise LogError(f"{path / INFO}: not the info.json of a LeRobot dataset: it needs `fps` and `features`")
+    wrong = [f for f, content in info["features"].items() if not _is_feature(content)]
+    if wrong:
+        raise LogError(f"{path / INFO}: not a feature of a LeRobot dataset: {some(wrong)}")
     missing = [f for f in (STATE, ACTION) if f not in info["features"]]
-    if missing or fps <= 0:
+    if missing or not 0 < fps < FASTEST:
         what = f"no feature {' and no feature '.join(missing)}" if missing else f"fps is {fps}"
         raise LogError(f"{path / INFO}: {what}; features: {some(info['features'], 20)}")
     storage = info.get("storage_format", "parquet")
@@ -123,9 +133,20 @@ def _info(path: Path) -> dict[str, Any]:
     return info
 
 
+def _is_feature(content: object) -> bool:
+    """Whether it says of what shape entries are, as far as it says so."""
+    if not isinstance(content, dict):
+        return False
+    shape = content.get("shape") or []
+    return isinstance(shape, list) and all(isinstance(n, int) and not isinstance(n, bool) for n in shape)
+
+
 def _names(path: Path, features: Mapping[str, Any], feature: str, told: ImportMap) -> list[str]:
     """Names of the entries of a list; of ``observation.state`` where only that one has names."""
-    size = int(np.prod(features[feature].get("shape") or [1]))
+    shape = features[feature].get("shape") or [1]
+    size = math.prod(shape)
+    if not 0 < size <= MOST:
+        raise LogError(f"{path}: {feature} has the shape {shape}; a robot has up to {MOST} joints")
     for source in (feature, STATE, ACTION):
         names = features.get(source, {}).get("names")
         if isinstance(names, dict):
@@ -176,6 +197,9 @@ def _frames(
     tables = []
     for file in files:
         with pq.ParquetFile(file) as opened:
+            require_memory(
+                memory_of(opened), f"{file}: its {opened.metadata.num_rows} rows", "choose episodes", LogError
+            )
             names = [n for n in opened.schema_arrow.names if not _is_picture(opened.schema_arrow.field(n).type)]
             tables.append(opened.read(columns=names))
     missing = [n for n in (STATE, ACTION, "episode_index") if any(n not in t.column_names for t in tables)]

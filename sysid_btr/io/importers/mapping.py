@@ -46,7 +46,6 @@ An example of all its sections:
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -56,6 +55,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from sysid_btr.errors import UsageError
 from sysid_btr.io.importers.units import NORMALISED, SI, check_key, group_of, resolve
 from sysid_btr.io.log import is_schema_column
+from sysid_btr.reading import parse_toml
 
 
 class _Part(BaseModel):
@@ -287,11 +287,10 @@ def read_map(path: Path | None) -> ImportMap:
     if path is None:
         return ImportMap()
     try:
-        with path.open("rb") as file:
-            content = tomllib.load(file)
+        content = parse_toml(path.read_bytes())
     except OSError as error:
         raise UsageError(f"--map {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise UsageError(f"--map {path} is not TOML: {error}") from error
     return _checked(content, f"--map {path}")
 

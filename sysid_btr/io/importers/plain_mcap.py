@@ -5,7 +5,6 @@ Format: mcap.dev/spec, version 0. JSON messages have the fields of the ROS messa
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from sysid_btr.io.importers.base import Recording
 from sysid_btr.io.importers.mapping import ImportMap
 from sysid_btr.io.importers.ros2 import Decoder, need
 from sysid_btr.io.importers.topics import read_bag
+from sysid_btr.reading import parse_json
 
 if TYPE_CHECKING:
     from mcap.reader import McapReader
@@ -86,7 +86,7 @@ class _McapBag:
         try:
             for schema, channel, message in self.reader.iter_messages(topics=list(topics)):
                 if decoder is None or channel.message_encoding == "json":
-                    content = json.loads(message.data, object_hook=_fields)
+                    content = parse_json(message.data, object_hook=_fields)
                 else:
                     content = decoder.decode(message.data, _long_name(schema.name if schema else ""))
                 yield channel.topic, message.log_time, content

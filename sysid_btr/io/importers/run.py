@@ -104,7 +104,7 @@ def import_log(
         try:
             chosen = _importer(path, importer)
             formats[str(path)] = chosen.name
-            recordings.append(chosen.read(path, told))
+            recordings.append(_read(chosen, path, told))
         except LogError as error:
             problems.append(error)
     if len(problems) == 1:
@@ -134,6 +134,21 @@ def _importer(path: Path, wanted: str | Importer) -> Importer:
     if not path.exists():
         raise LogError(f"{path}: no such file or folder; looked in {path.parent.resolve()}")
     return get_importer(wanted)
+
+
+def _read(importer: Importer, path: Path, told: ImportMap) -> Recording:
+    """What a source holds; whatever its content does to the reader is the content's."""
+    try:
+        return importer.read(path, told)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
+        raise LogError(
+            f"{path}: it is not what {importer.title} holds ({type(error).__name__}: {_one_line(error)}); "
+            "record or export it again, or give its columns as CSV"
+        ) from error
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 def _with_path(recording: Recording, sources: int) -> Iterator[str]:
