@@ -171,7 +171,7 @@ def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("motion", "effect", "seed", "seconds", "imitators"),
+    ("motion", "effect", "seed", "seconds", "imitators", "families"),
     [
         (
             "gait",
@@ -179,13 +179,14 @@ def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:
             5,
             9,
             ("joint_spring", "encoder_offset", "encoder_scale", "com_offset", "payload", "constant_force"),
+            {"spring"},  # a cable is one, between two joints
         ),
-        ("gait", "controller_dropout:HipPitch:start=1.8,duration=0.07,every=2.1", 5, 12, ("all",)),
-        ("poses", "controller_dropout:AnkleRoll:start=1.8,duration=0.12,every=2", 6, 12, ("all",)),
+        ("gait", "controller_dropout:HipPitch:start=1.8,duration=0.07,every=2.1", 5, 12, ("all",), set()),
+        ("poses", "controller_dropout:AnkleRoll:start=1.8,duration=0.12,every=2", 6, 12, ("all",), set()),
     ],
 )
-def test_what_others_can_only_imitate_is_not_given_their_name(
-    motion: Any, effect: str, seed: int, seconds: float, imitators: tuple[str, ...]
+def test_what_others_can_only_imitate_is_not_called_explained(
+    motion: Any, effect: str, seed: int, seconds: float, imitators: tuple[str, ...], families: set[str]
 ) -> None:
     """A gait repeats itself, so that a spring may stand for a cable, and a push for a servo that lets go."""
     pytest.importorskip("pinocchio", reason="the recorder needs Pinocchio (pip install pin)")
@@ -195,8 +196,8 @@ def test_what_others_can_only_imitate_is_not_given_their_name(
     recording = Recording(model, motion=motion, seed=seed, seconds=seconds, effects=(parse_effect(effect),))
     study = make_study(load_robot(model), [record(recording)[0]])
     found = close(study, ["mass:*Knee*", "kp:*=shared"], effects=imitators)
-    assert found.verdict == "unexplained", found.message
-    assert found.effects == ()
+    assert found.verdict in ("unexplained", "partly_explained"), found.message
+    assert {e.family for e in found.effects if e.likely} <= families, found.message
 
 
 def test_a_weak_motor_is_found() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.closing import Candidate
+from sysid_btr.diagnosis.closing import Candidate, NamedEffect
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
 from sysid_btr.diagnosis.scan import Perturbation, Sensitivity
 from sysid_btr.diagnosis.selection import (
@@ -56,7 +56,6 @@ def fitted(
     columns: Numbers | None = None,
     *,
     chance: float = 0.0,
-    overall_chance: float = 0.0,
     ahead: float = 0.0,
     model: Model | None = None,
 ) -> Fitted:
@@ -70,6 +69,8 @@ def fitted(
     gains = 0.5 * ahead * np.sqrt(4 / 3) + np.array([-1.0, 1.0, -1.0, 1.0])
     cells = np.zeros((len(held_out), 4))
     cells[0] = 100 - (gains if ahead else 0.0)
+    # as many samples in four stretches as make a column's chi2 scatter by so much
+    samples = 2 / max(chance, 1e-9) ** 2
     return Fitted(
         model=Model.of(()) if model is None else model,
         train=float(np.mean(fit)),
@@ -78,10 +79,11 @@ def fitted(
         holdout_columns=held_out,
         columns=held_out if columns is None else np.array(columns, dtype=np.float64),
         memory=np.ones(len(fit)),
-        chance=np.full(len(held_out if columns is None else columns), chance),
-        overall_chance=overall_chance,
+        holdout_memory=np.ones(len(held_out)),
         train_cells=np.zeros((len(fit), 0)),
         holdout_cells=cells,
+        train_counts=np.zeros((len(fit), 0)),
+        holdout_counts=np.full(cells.shape, samples / 4),
         evaluations=1,
         numerics=Numerics("RK4", 0.005),
     )
@@ -117,8 +119,8 @@ def test_the_limit_of_a_column_grows_with_what_chance_does_to_it() -> None:
         (fitted([1.0]), True),
         (fitted([1.02]), True),
         (fitted([1.04]), False),
-        (fitted([1.04], overall_chance=0.01), True),
-        (fitted([1.07], overall_chance=0.01), False),
+        (fitted([1.04], chance=0.01), True),
+        (fitted([1.07], chance=0.01), False),
         (fitted([1.0, 1.0], columns=[1.0, 1.11]), True),
         (fitted([1.0, 1.0], columns=[1.0, 1.13]), False),
         (fitted([1.0, 1.0], columns=[1.0, 1.13], chance=0.01), True),
@@ -603,26 +605,49 @@ def test_is_explained(last: float, floating: bool, expected: bool) -> None:
     assert is_explained(RULES, 101.0, last, 1.1, floating=floating) is expected
 
 
+def a_name(certainty: float, *rivals: str) -> NamedEffect:
+    return NamedEffect(
+        effect="coulomb_friction",
+        family="friction",
+        variant="",
+        where=("knee",),
+        parameters=(),
+        certainty=certainty,
+        otherwise={},
+        explains={},
+        provisional=False,
+        gain_holdout=0.5,
+        confused_with=rivals,
+        sentence="",
+        evidence={},
+    )
+
+
+SURE, DOUBTFUL, EITHER = a_name(0.9), a_name(0.4), a_name(0.9, "backlash")
+
+
 @pytest.mark.parametrize(
-    ("now", "rivals", "floating", "expected"),
+    ("now", "named", "floating", "expected"),
     [
         (fitted([1.09]), (), False, "nothing_missing"),
         (fitted([1.11]), (), False, "unexplained"),
         (fitted([1.0], [1.11]), (), False, "unexplained"),
-        (fitted([3.5]), ((),), False, "explained"),
-        (fitted([3.7]), ((),), False, "unexplained"),
-        (fitted([3.7]), ((),), True, "explained"),
-        (fitted([1.0], [3.7]), ((),), False, "unexplained"),
-        (fitted([3.5]), ((), ("backlash",)), False, "ambiguous"),
-        (fitted([3.7]), (("backlash",),), False, "unexplained"),
+        (fitted([3.5]), (SURE,), False, "explained"),
+        (fitted([3.7]), (SURE,), False, "partly_explained"),
+        (fitted([3.7]), (SURE,), True, "explained"),
+        (fitted([1.0], [3.7]), (SURE,), False, "partly_explained"),
+        (fitted([60.0]), (DOUBTFUL,), False, "unexplained"),
+        (fitted([60.0]), (DOUBTFUL, SURE), False, "partly_explained"),
+        (fitted([3.5]), (SURE, EITHER), False, "ambiguous"),
+        (fitted([3.7]), (EITHER,), False, "partly_explained"),
     ],
 )
-def test_verdict(now: Fitted, rivals: Sequence[Sequence[str]], floating: bool, expected: str) -> None:
-    assert verdict_of(RULES, fitted([101.0]), now, rivals, floating=floating) == expected
+def test_verdict(now: Fitted, named: Sequence[NamedEffect], floating: bool, expected: str) -> None:
+    assert verdict_of(RULES, fitted([101.0]), now, named, floating=floating) == expected
 
 
 def test_a_short_log_may_leave_more_by_chance() -> None:
-    assert verdict_of(RULES, fitted([2.0], overall_chance=0.1), fitted([1.39]), (), floating=False) == "nothing_missing"
+    assert verdict_of(RULES, fitted([2.0], chance=0.1), fitted([1.39]), (), floating=False) == "nothing_missing"
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
 from sysid_btr.diagnosis.scan import Perturbation
 from sysid_btr.diagnosis.signature import proposals, signature
-from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
+from sysid_btr.identify.missing_torque import MissingTorque, missing_torques
 from sysid_btr.identify.refit import refit
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log

@@ -92,12 +92,18 @@ def scores(rmse: float) -> Scores:
 def closing(study: Study, **changes: object) -> Closing:
     effect = NamedEffect(
         effect="coulomb_friction",
+        family="friction",
         variant="",
         where=("hinge",),
         parameters=(estimate("coulomb_friction:hinge"),),
+        certainty=0.93,
+        otherwise={"spring": 0.05},
+        explains={"train": 0.98, "holdout": 0.97},
+        provisional=True,
         gain_holdout=0.97,
         confused_with=("stribeck_friction",),
         sentence="dry friction at <hinge>",
+        evidence={"family": 0.9, "place": 1.0, "left": 0.2},
     )
     content: dict[str, object] = {
         "study": study,
@@ -130,7 +136,8 @@ def test_every_promised_key_is_there(study: Study) -> None:
     assert {"name", "unit", "nominal", "value", "std", "ci95", "bounds"} <= set(parameter)
     assert {"identifiable", "at_bound", "reason"} <= set(parameter)
     [effect] = result["effects"]
-    assert {"effect", "where", "parameters", "gain_holdout"} <= set(effect)
+    assert {"effect", "family", "where", "parameters", "certainty", "otherwise", "explains"} <= set(effect)
+    assert {"provisional", "gain_holdout", "evidence"} <= set(effect)
     assert set(effect["parameters"][0]) == set(parameter)
 
 
@@ -187,7 +194,7 @@ def test_exit_code_tells_a_finding_from_a_failure(study: Study) -> None:
     assert exit_code({**result, "effects": [], "parameters": [*result["parameters"], told]}) == 0
 
 
-@pytest.mark.parametrize("verdict", ["explained", "nothing_missing", "ambiguous", "unexplained"])
+@pytest.mark.parametrize("verdict", ["explained", "partly_explained", "nothing_missing", "ambiguous", "unexplained"])
 def test_the_report_holds_every_finding_and_escapes_names(study: Study, verdict: str) -> None:
     result = closing(study, verdict=verdict, message="a <b>bold</b> claim").to_dict()
     page = render(result, [Picture("overlay", "how to read it", b"light", b"dark")])
@@ -205,7 +212,16 @@ def test_tables_name_effect_interval_and_reason(study: Study, capsys: pytest.Cap
 
     show(closing(study, verdict="ambiguous").to_dict(), console(sys.stdout))
     text = capsys.readouterr().out
-    for part in ("dry friction at <hinge>", "not identifiable", "hardly any sensor", "0.280 .. 0.320", "mrad"):
+    for part in (
+        "dry friction at <hinge>",
+        "93 % certain",
+        "spring 5 %",
+        "provisional",
+        "not identifiable",
+        "hardly any sensor",
+        "0.280 .. 0.320",
+        "mrad",
+    ):
         assert part in text
 
 

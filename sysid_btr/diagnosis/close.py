@@ -16,7 +16,8 @@ from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
 from sysid_btr.diagnosis.split import later_split
 from sysid_btr.diagnosis.state import State
-from sysid_btr.diagnosis.verdict import conclude, verdict_of
+from sysid_btr.diagnosis.uncertainty import with_discrepancy
+from sysid_btr.diagnosis.verdict import conclude, named_effects, verdict_of
 from sysid_btr.errors import LogError
 from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal
@@ -48,8 +49,8 @@ def close(
     """Name the effects that a model lacks.
 
     Fit what is declared; scan every effect at every location; refit the leading hypotheses; let held-out data decide;
-    add the winner; repeat; drop what is not missed. An effect is named only if held-out data say so, and only if in the
-    end nearly all of the excess error is explained.
+    add the winner; repeat; drop what is not missed. An effect is added only if held-out data say so, and each is given
+    with how sure its name is; where nothing is more likely than not, nothing is named.
 
     Parameters
     ----------
@@ -77,12 +78,14 @@ def close(
         first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
         state = State.of(first, journal)
         state = search(state, usable_effects(asked, study), selection, progress)
-        state = eliminate(state, selection, progress)
+        state = with_discrepancy(eliminate(state, selection, progress))
         floating = state.study.procedure.leaves_ground_error
-        verdict = verdict_of(selection, state.before, state.fitted, state.rivals, floating=floating)
-        later = later_split(state.study, state.fitted, selection) if verdict == "unexplained" else None
+        named = named_effects(state, selection)
+        verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)
+        short = verdict in ("unexplained", "partly_explained")
+        later = later_split(state.study, state.fitted, selection) if short else None
         if later is None:
-            return conclude(state, verdict, selection, perf_counter() - began)
+            return conclude(state, verdict, named, selection, perf_counter() - began)
         # what is missing shows only after the fitted part: fit more of the log, hold out what is left
         study = replace(later, numerics=first.study.numerics, inflation={})
         journal = later.journal and later.journal.section()

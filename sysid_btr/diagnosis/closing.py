@@ -14,7 +14,7 @@ from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.model import Model
 
-Verdict = Literal["explained", "nothing_missing", "ambiguous", "unexplained"]
+Verdict = Literal["explained", "partly_explained", "nothing_missing", "ambiguous", "unexplained"]
 
 
 @dataclass(frozen=True)
@@ -24,21 +24,38 @@ class NamedEffect:
     Attributes
     ----------
     effect : name, as in the library.
+    family : of causes that it is a form of.
     variant : realisation under that name, or empty.
     where : joint or body names, or ``robot``.
     parameters : how large, with intervals.
+    certainty : probability that a cause of this family acts there; calibrated, see `sysid_btr.diagnosis.certainty`.
+    otherwise : probabilities of other families, the likeliest first.
+    explains : share of the error above the noise floor (squared) that vanishes with it, ``train`` and ``holdout``.
+    provisional : whether something is left where it acts, so that its form, or it, may be another.
     gain_holdout : fraction of the held-out chi2 that vanishes with it.
     confused_with : effects with which it is confounded on this log.
     sentence : the finding in words.
+    evidence : what the certainty rests on, by name.
     """
 
     effect: str
+    family: str
     variant: str
     where: tuple[str, ...]
     parameters: tuple[Estimate, ...]
+    certainty: float
+    otherwise: Mapping[str, float]
+    explains: Mapping[str, float]
+    provisional: bool
     gain_holdout: float
     confused_with: tuple[str, ...]
     sentence: str
+    evidence: Mapping[str, float]
+
+    @property
+    def likely(self) -> bool:
+        """Whether the name is more likely right than not."""
+        return self.certainty > 0.5
 
 
 @dataclass(frozen=True)

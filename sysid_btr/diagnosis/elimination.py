@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import (
     Selection,
@@ -84,7 +85,7 @@ def _prune(state: State, rules: Selection) -> tuple[State, list[str]]:
         state = state.spent(trial.evaluations)
         if not is_needed(rules, trial, state.fitted):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
-            state = replace(state, fitted=trial, rivals=state.without_rivals_of(effect))
+            state = replace(state, fitted=trial, evidence=state.without_evidence_of(effect))
     for effect in state.effects if len(state.effects) > 1 else ():
         state, dropped = _at_fewer_locations(state, effect, rules)
         if dropped:
@@ -104,18 +105,19 @@ def _at_fewer_locations(state: State, effect: Effect, rules: Selection) -> tuple
     dropped = tuple(p for p in effect.places if p not in left.hypothesis.places)
     if not dropped:
         return state, ()
-    own = state.rivals[state.effects.index(effect)]
-    return replace(state, fitted=left.fitted, rivals=(*state.without_rivals_of(effect), own)), dropped
+    own = state.evidence[state.effects.index(effect)]
+    return replace(state, fitted=left.fitted, evidence=(*state.without_evidence_of(effect), own)), dropped
 
 
 def _merged(state: State, rules: Selection) -> State:
     """Effects of one kind found in several rounds become one; amounts that agree become one amount."""
     pieces: dict[type[Effect], list[tuple[str, FloatArray]]] = {}
-    confused: dict[type[Effect], tuple[str, ...]] = {}
-    for effect, rivals in zip(state.effects, state.rivals, strict=True):
+    known: dict[type[Effect], Evidence] = {}
+    for effect, own in zip(state.effects, state.evidence, strict=True):
         amounts = effect.spread(state.fitted.model.own(effect)[None])[0]
         pieces.setdefault(type(effect), []).extend(zip(effect.places, amounts, strict=True))
-        confused[type(effect)] = tuple(dict.fromkeys((*confused.get(type(effect), ()), *rivals)))
+        before = known.get(type(effect))
+        known[type(effect)] = own if before is None else before.joined(own)
     model = state.fitted.model.without(*state.effects)
     for kind, found in pieces.items():
         places = tuple(p for p, _ in found)
@@ -124,9 +126,8 @@ def _merged(state: State, rules: Selection) -> State:
         values = np.median(amounts, axis=0) if even else amounts.ravel()
         model = model.with_(kind.at(places, state.study.scales, shared=even).around(values), values)
     # what is in the model beside an effect is not its rival
-    present = {kind.name for kind in pieces}
-    kept = tuple(tuple(name for name in names if name not in present) for names in confused.values())
-    return replace(state, fitted=replace(state.fitted, model=model), rivals=kept)
+    kept = tuple(own.beside([kind.name for kind in pieces]) for own in known.values())
+    return replace(state, fitted=replace(state.fitted, model=model), evidence=kept)
 
 
 def _distinguishable_from_nothing(state: State, rules: Selection) -> State | None:
@@ -152,8 +153,8 @@ def _distinguishable_from_nothing(state: State, rules: Selection) -> State | Non
         left = _at_locations(effect, kept, now)
         fitted = refit(now.study, now.fitted.model.replaced(effect, *left), polish=True)
         if predicts_as_well(rules, fitted, state.fitted):
-            rivals = (*now.rivals[:at], *((now.rivals[at],) if left else ()), *now.rivals[at + 1 :])
-            result = now = replace(now, fitted=fitted, rivals=rivals)
+            known = (*now.evidence[:at], *((now.evidence[at],) if left else ()), *now.evidence[at + 1 :])
+            result = now = replace(now, fitted=fitted, evidence=known)
     return result
 
 

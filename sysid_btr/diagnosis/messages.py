@@ -61,7 +61,7 @@ def message_of(
         old, new, floor = si_all(
             [before.holdout[channel].rmse, nearest.holdout[channel].rmse, before.holdout[channel].floor], unit
         )
-        change = f"{old} -> {new}" if verdict in ("explained", "ambiguous") else old
+        change = old if verdict in ("unexplained", "nothing_missing") else f"{old} -> {new}"
         errors = f" Held-out {channel} error {change} (noise floor {floor})."
     if verdict == "nothing_missing":
         return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
@@ -70,12 +70,29 @@ def message_of(
         if effects:
             listing = ", ".join(f"{e.effect} at {_places(e.where)}" for e in effects)
             rest = _left(before, nearest, channel)
-            hint = f" The nearest, {listing}, leaves {rest} (squared), too much to be named.{hint}"
+            hint = f" The nearest, {listing}, leaves {rest} (squared), and is less likely than not.{hint}"
         return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
+    listing = "; ".join(e.sentence for e in effects)
+    if verdict == "partly_explained":
+        return _partly(effects, _left(before, nearest, channel), left) + errors
     if left:
         errors += f" A residual remains that no effect accounts for: {left.get('summary', 'not characterised')}."
-    listing = "; ".join(e.sentence for e in effects)
     if verdict == "ambiguous":
         other = ", ".join(dict.fromkeys(c for e in effects for c in e.confused_with))
         return f"Ambiguous: the model lacks {listing}; on this log it is confounded with {other}." + errors
     return f"The model lacks {listing}." + errors
+
+
+def _partly(effects: Sequence[NamedEffect], rest: str, left: Mapping[str, Any] | None) -> str:
+    """What is likely, what else was added, and what is left."""
+    likely = [e for e in effects if e.likely]
+    text = "Partly explained: the model lacks " + "; ".join(
+        f"{e.sentence} ({100 * e.certainty:.0f} % certain of the {e.family}{', its form open' * e.provisional})"
+        for e in likely
+    )
+    others = [e for e in effects if not e.likely]
+    if others:
+        added = "; ".join(f"{e.sentence} ({100 * e.certainty:.0f} %)" for e in others)
+        text += f". Also added, less likely than not to be what it is called: {added}"
+    text += f". {rest[0].upper()}{rest[1:]} (squared, above the noise) is left"
+    return text + (f": {left.get('summary', 'not characterised')}." if left else ".")

@@ -11,6 +11,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.elimination import without_dispensable
+from sysid_btr.diagnosis.evidence import evidence_of
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
 from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, perturbations, scan
 from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain
@@ -93,19 +94,20 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
     kept, spent = without_dispensable(study, winner, rules)
     hypothesis, fitted = kept.hypothesis, kept.fitted
     rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
+    evidence = evidence_of(winner, trials, rivals)
     # a more general effect takes the place of the special case it includes
     gone = [
         e
         for e in state.effects
         if (e.label or e.name) in hypothesis.effect.includes and set(e.places) <= set(hypothesis.places)
     ]
-    staying = [r for e, r in zip(state.effects, state.rivals, strict=True) if e not in gone]
+    staying = [known for e, known in zip(state.effects, state.evidence, strict=True) if e not in gone]
     if gone:
         rest = fitted.model.without(*gone, fitted.model.terms[-1])
         fitted = refit(study, rest.with_(hypothesis.term(study.scales), hypothesis.start))
     study = study.with_initial_states(fitted.model)
     study, fitted = robust_refit(study, fitted, 1)
-    state = replace(state, study=study, fitted=fitted, rivals=(*staying, rivals)).spent(spent + fitted.evaluations)
+    state = replace(state, study=study, fitted=fitted, evidence=(*staying, evidence)).spent(spent + fitted.evaluations)
     return state.step(added=(str(hypothesis),))
 
 

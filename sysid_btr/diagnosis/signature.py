@@ -1,6 +1,6 @@
 """What the residual looks like: proposals for effects with a place in time or angle, and words for the rest.
 
-Both look at the torque that would explain the position error (`sysid_btr.diagnosis.torque`), because a torque
+Both look at the torque that would explain the position error (`sysid_btr.identify.missing_torque`), because a torque
 is local in time where a position error is smeared out by the servo.
 """
 
@@ -16,7 +16,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
 from sysid_btr.diagnosis.scan import Perturbation
 from sysid_btr.diagnosis.signal_features import Line, Train, hats, predicted_share, without
-from sysid_btr.diagnosis.torque import MissingTorque, missing_torques
+from sysid_btr.identify.missing_torque import MissingTorque, missing_torques
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbance, ExternalDisturbanceTrain

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from sysid_btr.diagnosis.closing import Candidate, StepRecord
+from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import Estimate
@@ -24,7 +25,7 @@ class State:
     first : fit of the declared parameters, the model's first terms.
     before : the same as judged when the search began.
     fitted : the model so far.
-    rivals : for each effect, what it may be confused with.
+    evidence : for each effect, what speaks for its name.
     steps, candidates : for the record.
     replays : candidates simulated.
     estimates : of all parameters; of the declared ones until effects have intervals.
@@ -35,7 +36,7 @@ class State:
     first: Fit
     before: Fitted
     fitted: Fitted
-    rivals: tuple[tuple[str, ...], ...]
+    evidence: tuple[Evidence, ...]
     steps: tuple[StepRecord, ...]
     candidates: tuple[Candidate, ...]
     replays: int
@@ -66,7 +67,7 @@ class State:
         record = StepRecord(tuple(added), tuple(removed), self.fitted.train, self.fitted.holdout)
         return replace(self, steps=(*self.steps, record))
 
-    def without_rivals_of(self, effect: Effect) -> tuple[tuple[str, ...], ...]:
-        """The rivals of all other effects."""
+    def without_evidence_of(self, effect: Effect) -> tuple[Evidence, ...]:
+        """What speaks for all other effects."""
         at = self.effects.index(effect)
-        return self.rivals[:at] + self.rivals[at + 1 :]
+        return self.evidence[:at] + self.evidence[at + 1 :]

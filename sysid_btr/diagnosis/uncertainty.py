@@ -9,11 +9,23 @@ import numpy as np
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.nuisance import error_of_the_rest
 from sysid_btr.identify.refit import judge, refit
 from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
+
+
+def with_discrepancy(state: State) -> State:
+    """The state with intervals that hold although something is left, where that is more than noise."""
+    study, model = state.study, state.fitted.model
+    if state.reported is None or not state.fitted.train > study.procedure.tolerated:
+        return state
+    problem = study.train_problem(model)
+    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
+    found = widened(state.estimates, problem, model.values, np.nan_to_num(jacobian), residual, study.scales)
+    return replace(state, estimates=found)
 
 
 def with_intervals(state: State, rules: Selection) -> State:

@@ -4,39 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sysid_btr.diagnosis import certainty
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, Verdict
+from sysid_btr.diagnosis.evidence import Evidence, left_where_it_acts, share_explained
 from sysid_btr.diagnosis.messages import message_of, sentence_of
 from sysid_btr.diagnosis.selection import Selection, is_explained, something_left, verdict_limit
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
+from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted, judge
 from sysid_btr.identify.scores import score
 from sysid_btr.models.robot import channel_units
-from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.effect import Effect, family_of
 from sysid_btr.terms.library import select_effects
+
+NAMED: tuple[Verdict, ...] = ("explained", "partly_explained", "ambiguous")
+"""Verdicts that name effects."""
 
 
 def verdict_of(
-    rules: Selection, before: Fitted, now: Fitted, rivals: Sequence[Sequence[str]], *, floating: bool
+    rules: Selection, before: Fitted, now: Fitted, named: Sequence[NamedEffect], *, floating: bool
 ) -> Verdict:
-    """The verdict on effects, one entry of `rivals` each, that lead from one model to another."""
+    """The verdict on effects that lead from one model to another."""
     limit = verdict_limit(rules, before.overall_chance)
-    if not rivals:
+    if not named:
         return "nothing_missing" if max(now.holdout, now.train) <= limit else "unexplained"
     # what happens in the fitted part alone must be explained there
-    for first, last in ((before.holdout, now.holdout), (before.train, now.train)):
-        if not is_explained(rules, first, last, limit, floating=floating):
-            return "unexplained"
-    return "ambiguous" if any(rivals) else "explained"
+    parts = ((before.holdout, now.holdout), (before.train, now.train))
+    if all(is_explained(rules, first, last, limit, floating=floating) for first, last in parts):
+        return "ambiguous" if any(e.confused_with for e in named) else "explained"
+    return "partly_explained" if any(e.likely for e in named) else "unexplained"
 
 
-def conclude(state: State, verdict: Verdict, rules: Selection, seconds: float) -> Closing:
+def conclude(state: State, verdict: Verdict, named: Sequence[NamedEffect], rules: Selection, seconds: float) -> Closing:
     """The result of a diagnosis that has come to its verdict."""
     study, first = state.study, state.first
-    named = _named(state)
-    kept = named if verdict in ("explained", "ambiguous") else ()
+    kept = tuple(named) if verdict in NAMED else ()
     left = None
-    if verdict == "unexplained" or (kept and something_left(rules, state.before, state.fitted)):
+    if verdict in ("unexplained", "partly_explained") or (kept and something_left(rules, state.before, state.fitted)):
         left = signature(study, state.fitted.model)
     reported = state.reported
     if reported is None:
@@ -66,29 +71,43 @@ def conclude(state: State, verdict: Verdict, rules: Selection, seconds: float) -
     )
 
 
-def _named(state: State) -> tuple[NamedEffect, ...]:
-    """Every effect with its parameters, what held-out data lose without it, and what it may be confused with."""
-    result, model = [], state.fitted.model
-    for effect, confused in zip(state.effects, state.rivals, strict=True):
+def named_effects(state: State, rules: Selection) -> tuple[NamedEffect, ...]:
+    """Every effect with its parameters, how sure it is, what data lose without it, and what it may be confused with."""
+    model = state.fitted.model
+    result = []
+    for effect, evidence in zip(state.effects, state.evidence, strict=True):
         columns = model.terms.columns(effect)
-        own = state.estimates[columns]
         without = model.values.copy()
         without[columns] = effect.neutral
         off = judge(state.study, model.at(without))
-        gain = (off.holdout - state.fitted.holdout) / max(off.holdout, 1e-12)
-        confused = (*confused, *(n for n in giving_way(effect, state.candidates) if n not in confused))
-        result.append(
-            NamedEffect(
-                effect=effect.name,
-                variant=effect.variant,
-                where=effect.places,
-                parameters=own,
-                gain_holdout=float(gain),
-                confused_with=confused,
-                sentence=sentence_of(effect, own),
-            )
-        )
+        result.append(_named(effect, state.estimates[columns], evidence, off, state, rules))
     return tuple(result)
+
+
+def _named(
+    effect: Effect, own: tuple[Estimate, ...], evidence: Evidence, off: Fitted, state: State, rules: Selection
+) -> NamedEffect:
+    now = state.fitted
+    left = left_where_it_acts(off, now)
+    known = {"family": evidence.family, "place": evidence.place, "left": left}
+    sure = certainty.STANDARD.certainty(known)
+    rest = sum(evidence.others.values())
+    otherwise = {name: (1 - sure) * weight / max(rest, evidence.family) for name, weight in evidence.others.items()}
+    return NamedEffect(
+        effect=effect.name,
+        family=family_of(type(effect)),
+        variant=effect.variant,
+        where=effect.places,
+        parameters=own,
+        certainty=sure,
+        otherwise=otherwise,
+        explains={"train": share_explained(off.train, now.train), "holdout": share_explained(off.holdout, now.holdout)},
+        provisional=left > rules.rest,
+        gain_holdout=float((off.holdout - now.holdout) / max(off.holdout, 1e-12)),
+        confused_with=tuple(dict.fromkeys((*evidence.rivals, *giving_way(effect, state.candidates)))),
+        sentence=sentence_of(effect, own),
+        evidence=known,
+    )
 
 
 def giving_way(effect: Effect, candidates: Sequence[Candidate]) -> tuple[str, ...]:

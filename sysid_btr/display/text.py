@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from statistics import median
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 from sysid_btr.display.changes import model_lines
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
 PLAIN_WIDTH = 118
 """Columns where the output is no terminal, so that what is piped does not depend on a window."""
 CANDIDATES_SHOWN, EXACT_SHOWN = 6, 4
+PARTS = (("train", "fitted"), ("holdout", "held-out"))
+MENTIONED = 0.01
+"""Probability from which another cause is mentioned."""
 
 
 class Finding(Protocol):
@@ -66,9 +70,10 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield errors_table(result)
     for effect in result.get("effects", []):
         yield Text(f"+ {effect['sentence'] or effect['effect']}")
+        yield Text(f"  {certainty_words(effect)}")
         if effect["confused_with"]:
             yield Text(f"  confounded on this log with: {', '.join(effect['confused_with'])}")
-    estimates = [*result.get("parameters", []), *(p for e in result.get("effects", []) for p in e["parameters"])]
+    estimates = estimates_of(result)
     if estimates:
         yield parameters_table(estimates)
         yield from map(Text, exactness(result))
@@ -76,7 +81,7 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
             if p["reason"]:
                 yield Text(f"  {p['name']}: {identifiability(p)}: {p['reason']}")
     yield from (Text(line) for line in model_lines(result))
-    if result.get("verdict") in ("ambiguous", "unexplained") and result.get("candidates"):
+    if result.get("verdict") in ("ambiguous", "partly_explained", "unexplained") and result.get("candidates"):
         yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
     if result.get("signature"):
         yield Text("residual: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
@@ -95,6 +100,17 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
         + (f"; seed {result['seed']}" if result.get("seed") is not None else ""),
         style="dim",
     )
+
+
+def certainty_words(effect: Mapping[str, Any]) -> str:
+    """How sure a name is, what else it would be, and what it explains."""
+    text = f"{100 * effect['certainty']:.0f} % certain of the {effect['family']}"
+    others = [f"{name} {100 * p:.0f} %" for name, p in effect["otherwise"].items() if p >= MENTIONED]
+    if others:
+        text += f" (else {', '.join(others)})"
+    gone = [f"{100 * effect['explains'][part]:.3g} % of the {name}" for part, name in PARTS]
+    text += f"; it removes {' and '.join(gone)} error above the noise (squared)"
+    return text + ("; something is left where it acts, so its form is provisional" if effect["provisional"] else "")
 
 
 def episode_words(result: Mapping[str, Any]) -> Iterator[str]:
@@ -171,11 +187,24 @@ def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
+def estimates_of(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """All parameters of a result: the declared ones, then those of its effects."""
+    return [*result.get("parameters", []), *(p for e in result.get("effects", []) for p in e["parameters"])]
+
+
 def exactness(result: Mapping[str, Any]) -> Iterator[str]:
     """What intervals take as exact, and what they do not."""
     exact, allowed = result.get("taken_as_exact"), result.get("nuisance")
     if exact is None:
         return
+    wider = [p["std"] / p["std_if_right"] for p in estimates_of(result) if p.get("std_if_right")]
+    if wider:
+        yield (
+            "the model leaves more than noise: intervals also hold for unknown torques at the joints, as large as what "
+            f"is left, and are {number(median(wider), 2)} times as wide (median) as if the model were right"
+        )
+    elif result.get("misfit"):
+        yield "the model leaves more than noise, and intervals hold for the model as it is"
     if allowed:
         sizes = ", ".join(f"{name} by {number(std)}" for name, std in allowed.items())
         yield f"intervals hold where what is not fitted is off: {sizes} (one standard deviation)"

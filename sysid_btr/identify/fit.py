@@ -18,6 +18,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.bounds import grow_bounds
 from sysid_btr.identify.coarse import realise_servo, weigh_columns
 from sysid_btr.identify.deferred import deferred_fit
+from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
 from sysid_btr.identify.nuisance import assumptions, check_nuisance, error_of_the_rest
@@ -34,6 +35,10 @@ from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
     from numpy.random import Generator
+
+
+RISES = 1.01
+"""Ratio of errors beyond which one is said to rise: less is a matter of the numerics."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +88,8 @@ class Fit(StudyOutcome):
             nominal, before = self.nominal.holdout[channel], self.before.holdout[channel]
             unit = channel_units(self.study.robot)[channel].partition(",")[0]
             first, last, floor = si_all([nominal.rmse, before.rmse, before.floor], unit)
-            parts.append(f"the held-out {channel} error goes from {first} to {last}, with a noise floor of {floor}")
+            goes = "rises" if before.rmse > RISES * nominal.rmse else "goes"
+            parts.append(f"the held-out {channel} error {goes} from {first} to {last}, with a noise floor of {floor}")
         if not self.result.converged:
             parts.append("the fit did not converge")
         return "; ".join(parts) + "."
@@ -188,12 +194,15 @@ def fit(
     if solved.by_residuals:
         values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))
         replays += spent
+    before = score(study, model.at(values))
+    if misfit_of(before.train, study.leading_channel, study.procedure.tolerated) is not None:
+        found = widened(found, problem, at.values, jacobian, residual, study.scales)
     return Fit(
         study=study,
         model=model.at(values),
         estimates=found,
         nominal=score(study, Model.of(terms)),
-        before=score(study, model.at(values)),
+        before=before,
         result=solved.result,
         numerics_shift=shift,
         replays=replays,

@@ -31,6 +31,7 @@ class Estimate:
     identifiable : whether it is, from this log.
     at_bound : whether the estimate lies on a bound.
     reason : why it is not identifiable, or what limits it; empty otherwise.
+    std_if_right : standard error if the model were right, where `std` and `ci95` hold for what it lacks too; else None.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Estimate:
     identifiable: Identifiable
     at_bound: bool
     reason: str
+    std_if_right: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,10 +35,11 @@ class Fitted:
     model : terms and their values.
     train, holdout : mean square of error over noise floor.
     train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
-    memory : integrated autocorrelation, in samples, of each column's fitted residual; 1 if white.
-    chance, overall_chance : standard deviation of `columns` and of `holdout` at the floor, by chance alone.
+    memory, holdout_memory : integrated autocorrelation, in samples, of each column's residual, fitted and held out; 1
+        if white.
     train_cells, holdout_cells : (columns, stretches) sums of squares over noise floor by stretch of half a
         second.
+    train_counts, holdout_counts : (columns, stretches) number of samples.
     evaluations : candidates simulated.
     numerics : with which it was judged.
     """
@@ -49,12 +51,24 @@ class Fitted:
     holdout_columns: FloatArray
     columns: FloatArray
     memory: FloatArray
-    chance: FloatArray
-    overall_chance: float
+    holdout_memory: FloatArray
     train_cells: FloatArray
     holdout_cells: FloatArray
+    train_counts: FloatArray
+    holdout_counts: FloatArray
     evaluations: int
     numerics: Numerics
+
+    @property
+    def chance(self) -> FloatArray:
+        """Standard deviation of `columns` at the floor, by chance alone."""
+        fitted, heldout = self.train_counts.sum(axis=1), self.holdout_counts.sum(axis=1)
+        return np.asarray(np.sqrt(2 / np.maximum(_together(fitted, heldout, np.add), 1)))
+
+    @property
+    def overall_chance(self) -> float:
+        """The same of `holdout`."""
+        return float(np.sqrt(2 / max(self.holdout_counts.sum(), 1)))
 
     @property
     def misfit(self) -> float:
@@ -148,25 +162,32 @@ def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:
     holdout = study.holdout_problem(model)
     r, s = of_both(train, holdout, lambda problem: np.asarray(problem.residuals(model.values[None])[0]))
     train_columns, holdout_columns = train.column_chi2(r), holdout.column_chi2(s)
+    train_cells, train_counts = _by_cell(train, r)
+    holdout_cells, holdout_counts = _by_cell(holdout, s)
     a, b = train.counts, holdout.counts
-    same = len(a) == len(b)
     return Fitted(
         model=model,
         train=float(np.average(train_columns, weights=a)),
         holdout=float(np.average(holdout_columns, weights=b)),
         train_columns=train_columns,
         holdout_columns=holdout_columns,
-        columns=(train_columns * a + holdout_columns * b) / np.maximum(a + b, 1)
-        if same
-        else np.concatenate([train_columns, holdout_columns]),
+        columns=_together(train_columns, holdout_columns, lambda x, y: (x * a + y * b) / np.maximum(a + b, 1)),
         memory=_memory(train, r),
-        chance=np.sqrt(2 / np.maximum(a + b if same else np.concatenate([a, b]), 1)),
-        overall_chance=float(np.sqrt(2 / max(b.sum(), 1))),
-        train_cells=_by_cell(train, r),
-        holdout_cells=_by_cell(holdout, s),
+        holdout_memory=_memory(holdout, s),
+        train_cells=train_cells,
+        holdout_cells=holdout_cells,
+        train_counts=train_counts,
+        holdout_counts=holdout_counts,
         evaluations=evaluations + 1,
         numerics=study.numerics,
     )
+
+
+def _together(
+    fitted: FloatArray, heldout: FloatArray, join: Callable[[FloatArray, FloatArray], FloatArray]
+) -> FloatArray:
+    """One number for each column of all data: joined where the same columns are held out, else one after another."""
+    return join(fitted, heldout) if len(fitted) == len(heldout) else np.concatenate([fitted, heldout])
 
 
 def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
@@ -226,13 +247,14 @@ def _memory(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     return np.maximum(ratio, 1.0)
 
 
-def _by_cell(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
-    """Sums of squares over noise floor, (columns, stretches)."""
+def _by_cell(problem: ReplayProblem, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sums of squares over noise floor, and numbers of samples, (columns, stretches) each."""
     columns, blocks = problem.column_labels, problem.blocks
-    width = int(blocks.max()) + 1
+    width, height = int(blocks.max()) + 1, len(problem.columns)
     square = np.nan_to_num(residual, nan=1e6) ** 2 * problem.inflation[columns]
-    sums = np.bincount(columns * width + blocks, square, len(problem.columns) * width)
-    return np.asarray(sums.reshape(-1, width), dtype=np.float64)
+    cell = columns * width + blocks
+    sums, counts = (np.bincount(cell, w, height * width) for w in (square, np.ones(len(residual))))
+    return np.asarray(sums.reshape(-1, width)), np.asarray(counts.reshape(-1, width))
 
 
 def paired_t(better: Fitted, worse: Fitted) -> float:

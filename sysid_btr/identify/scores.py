@@ -73,8 +73,7 @@ class Misfit:
         """In a sentence."""
         return (
             f"what is left of the {self.channel} is {self.times_noise:.2g} times its noise, most at {self.joint}: the "
-            "model lacks something, and intervals hold for the model as it is (`sysid-btr close` looks for what is "
-            "missing)"
+            "model lacks something (`sysid-btr close` looks for what is missing)"
         )
 
 

@@ -11,7 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.display.changes import model_lines
-from sysid_btr.display.text import compact, episode_words, exactness, identifiability, number, stages
+from sysid_btr.display.text import (
+    certainty_words,
+    compact,
+    episode_words,
+    estimates_of,
+    exactness,
+    identifiability,
+    number,
+    stages,
+)
 from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
@@ -22,9 +31,10 @@ LARGEST, LARGEST_RAW = 4_000_000, 500_000
 TEMPLATE = Path(__file__).with_name("report.html.j2")
 VERDICTS = {
     "explained": "The log shows effects that the model lacks, and they are named below.",
+    "partly_explained": "The log shows effects that the model lacks, named below, and something more.",
     "nothing_missing": "With these parameters the model explains the log down to the noise of its sensors.",
     "ambiguous": "Something is missing, and on this log several effects that would explain it are confounded.",
-    "unexplained": "Something is missing that no effect of the library explains.",
+    "unexplained": "Something is missing, and no name for it is more likely than not.",
 }
 
 
@@ -62,7 +72,7 @@ def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         rows=list(_error_rows(result)),
         floors=any(floor is not None for floor in result.get("noise_floor", {}).values()),
         bars=_bars(result),
-        estimates=[*result.get("parameters", []), *(p for e in result.get("effects", []) for p in e["parameters"])],
+        estimates=estimates_of(result),
         intervals=_intervals(result),
         pictures=[(p, _data_uri(p.light), None if p.dark is None else _data_uri(p.dark)) for p in shown],
         left_out=left_out,
@@ -85,7 +95,7 @@ def _intervals(result: Mapping[str, Any]) -> str:
         result["kind"],
         " ".join(
             (
-                f"Intervals hold for correlated residuals and for the replay's own numerical error; {limit}",
+                "Intervals hold for correlated residuals and for the replay's own numerical error.",
                 *(f"{words[0].upper()}{words[1:]}." for words in exactness(result)),
             )
         ),
@@ -119,6 +129,7 @@ def _template() -> Template:
         identifiability=identifiability,
         compact=compact,
         digits=with_digits_of,
+        certainty=certainty_words,
         typeset=_typeset,
         count=_count,
     )

@@ -111,6 +111,11 @@ class Effect(Term):
         return result
 
 
+def family_of(effect: type[Effect]) -> str:
+    """The family of causes that an effect is a form of; one that says none is one of its own."""
+    return effect.family or effect.name
+
+
 @dataclass(frozen=True)
 class DofEffect(Effect):
     """An effect that is a compiled field of a joint's degree of freedom; of several numbers the first.

@@ -15,7 +15,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
-from sysid_btr.objectives.targets import WARM_UP, Target
+from sysid_btr.objectives.targets import WARM_UP
 from sysid_btr.simulation.inverse import InverseReplay
 from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Outputs, Term
@@ -106,10 +106,7 @@ def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) 
         if isinstance(episode.replay, InverseReplay):
             result += _compared(i, episode, episode.replay, values, scales)
             continue
-        target = next((t for t in episode.targets if t.channel == "position"), None)
-        # segments are too short for the memory of a deconvolution
-        if target is not None and episode.marginal is None:
-            result += _deconvolve(i, episode, target, values, scales)
+        result += _deconvolve(i, episode, values, scales)
     return tuple(result)
 
 
@@ -183,55 +180,115 @@ class _Clock:
         return np.asarray(fine[:whole].reshape(-1, self.together, fine.shape[1]).mean(axis=1))
 
 
-def _deconvolve(
-    number: int, episode: Comparison, target: Target, values: FloatArray, scales: Scales
-) -> list[MissingTorque]:
-    log = episode.replay.log
-    clock = _Clock.over(log.time)
-    joints = target.joints
-    where = subtrees(episode.replay.model)
-    members: dict[int, list[int]] = {}
-    for k, joint in enumerate(joints):
-        members.setdefault(where[joint], []).append(k)
-    spacing = min(LONGEST_MEMORY, clock.time[-1] / (PULSES + 1))
-    memory = int(spacing / clock.period)
-    if memory < 4:
+@dataclass(frozen=True, eq=False)
+class TorqueResponse:
+    """How what one episode's sensors show answers small torques at its joints, and the state that goes with it.
+
+    Attributes
+    ----------
+    joints : (k,) at which torques act.
+    members : positions, in `joints`, of those of each subtree; joints of one subtree move each other.
+    shown : (k,) joints of each channel that is compared, by channel.
+    impulses : by channel and subtree, (memory, shown of the subtree, members): response to one sample of unit torque.
+    clock : of the uniform grid.
+    error : (n, k) position measured minus predicted.
+    chi2 : (k,) mean square of the samples of it that count, over the noise floor.
+    states : (n, k) each: position as measured, velocity, servo (torque), predicted (position), command.
+    """
+
+    joints: tuple[str, ...]
+    members: tuple[tuple[int, ...], ...]
+    shown: dict[str, tuple[tuple[int, ...], ...]]
+    impulses: dict[str, tuple[FloatArray, ...]]
+    clock: _Clock
+    error: FloatArray
+    chi2: FloatArray
+    states: dict[str, FloatArray]
+
+    @classmethod
+    def of(cls, episode: Comparison, values: FloatArray, scales: Scales) -> TorqueResponse | None:
+        """By simulation; None where that diverges, where no positions are compared, or only over short segments."""
+        target = next((t for t in episode.targets if t.channel == "position"), None)
+        # segments are too short for the memory of a response
+        if target is None or episode.marginal is not None or isinstance(episode.replay, InverseReplay):
+            return None
+        clock, joints = _Clock.over(episode.replay.log.time), target.joints
+        where = subtrees(episode.replay.model)
+        members: dict[int, list[int]] = {}
+        for k, joint in enumerate(joints):
+            members.setdefault(where[joint], []).append(k)
+        spacing = min(LONGEST_MEMORY, clock.time[-1] / (PULSES + 1))
+        memory = int(spacing / clock.period)
+        if memory < 4:
+            return None
+        sizes = np.array([scale_at(scales, j).torque_peak for j in joints])
+        width = max(clock.period, episode.replay.numerics.timestep)
+        rest = (0.0, clock.period * memory, width, clock.period * memory)
+        outputs = _pulsed(
+            episode, values, ExternalDisturbanceTrain.at(joints, scales), rest, sizes, [*members.values()]
+        )
+        if not np.isfinite(outputs.position).all() or outputs.effort is None:
+            return None
+        shown: dict[str, tuple[tuple[int, ...], ...]] = {}
+        impulses: dict[str, tuple[FloatArray, ...]] = {}
+        for one in episode.targets:
+            predicted = one.predicted(outputs)
+            moved = [clock.uniform(p - predicted[0]) for p in predicted[1:]]
+            shown[one.channel] = tuple(
+                tuple(i for i, joint in enumerate(one.joints) if where[joint] == subtree) for subtree in members
+            )
+            impulses[one.channel] = tuple(
+                np.stack(
+                    [
+                        _impulse(moved[row][:, seen], memory) / (sizes[k] * width / clock.period)
+                        for row, k in enumerate(own)
+                    ],
+                    axis=2,
+                )
+                for own, seen in zip(members.values(), shown[one.channel], strict=True)
+            )
+        predicted, columns = target.predicted(outputs)[0], target.columns
+        states = {
+            "position": clock.uniform(np.where(np.isfinite(target.measured), target.measured, predicted)),
+            "velocity": clock.uniform(outputs.velocity[0][:, columns]),
+            "servo": clock.uniform(outputs.effort[0][:, columns]),
+            "predicted": clock.uniform(predicted),
+            "command": clock.uniform(_commands(episode, columns)),
+        }
+        error = target.measured - predicted
+        white = np.where(target.mask, error / target.noise, 0.0)
+        chi2 = (white**2).sum(axis=0) / np.maximum(target.mask.sum(axis=0), 1)
+        groups = tuple(map(tuple, members.values()))
+        return cls(joints, groups, shown, impulses, clock, clock.uniform(error), chi2, states)
+
+    def shows(self, channel: str, joint: int, torques: FloatArray) -> tuple[tuple[int, ...], FloatArray]:
+        """What torques (n, m) at one joint do to a channel: which of its joints, and (n, m, joints)."""
+        subtree = next(i for i, own in enumerate(self.members) if joint in own)
+        impulse = self.impulses[channel][subtree][:, :, self.members[subtree].index(joint)]
+        size = len(torques) + len(impulse)
+        spectrum = np.fft.rfft(torques, size, axis=0)[:, :, None] * np.fft.rfft(impulse, size, axis=0)[:, None, :]
+        return self.shown[channel][subtree], np.asarray(np.fft.irfft(spectrum, size, axis=0)[: len(torques)])
+
+
+def _deconvolve(number: int, episode: Comparison, values: FloatArray, scales: Scales) -> list[MissingTorque]:
+    found = TorqueResponse.of(episode, values, scales)
+    if found is None:
         return []
-    sizes = np.array([scale_at(scales, j).torque_peak for j in joints])
-    width = max(clock.period, episode.replay.numerics.timestep)
-    rest = (0.0, clock.period * memory, width, clock.period * memory)
-    outputs = _pulsed(episode, values, ExternalDisturbanceTrain.at(joints, scales), rest, sizes, list(members.values()))
-    predicted = outputs.position[:, :, target.columns]
-    if not np.isfinite(predicted).all() or outputs.effort is None:
-        return []
-    error = clock.uniform(target.measured - predicted[0])
-    # response of every joint to every joint of its subtree, per unit torque over one sample
-    moved = [clock.uniform(p - predicted[0]) for p in predicted[1:]]
+    target = next(t for t in episode.targets if t.channel == "position")
+    clock, error, states, joints = found.clock, found.error, found.states, found.joints
     torque = np.empty_like(error)
     noise = np.empty(len(joints))
     gains: dict[int, FloatArray] = {}
     frequency = np.zeros(0)
-    for own in members.values():
-        response = np.empty((memory, len(own), len(own)))
-        for row, k in enumerate(own):
-            response[:, :, row] = _impulse(moved[row][:, own], memory) / (sizes[k] * width / clock.period)
+    for own, response in zip(map(list, found.members), found.impulses["position"], strict=True):
         floor = target.noise[own] / np.sqrt(clock.together)
-        found = _wiener(error[:, own], response, floor)
-        torque[:, own], noise[own] = found.torque, found.noise
-        frequency = found.frequency / clock.period
-        gains.update({k: found.gain[:, i] for i, k in enumerate(own)})
+        inverse = _wiener(error[:, own], response, floor)
+        torque[:, own], noise[own] = inverse.torque, inverse.noise
+        frequency = inverse.frequency / clock.period
+        gains.update({k: inverse.gain[:, i] for i, k in enumerate(own)})
     keep = slice(int(min(WARM_UP, 0.1 * clock.time[-1]) / clock.period), len(error) - int(EDGE / clock.period))
-    columns = target.columns
-    states = {
-        "position": clock.uniform(np.where(np.isfinite(target.measured), target.measured, predicted[0])),
-        "velocity": clock.uniform(outputs.velocity[0][:, columns]),
-        "servo": clock.uniform(outputs.effort[0][:, columns]),
-        "predicted": clock.uniform(predicted[0]),
-        "command": clock.uniform(_commands(episode, columns)),
-    }
     acceleration = np.gradient(states["velocity"], clock.period, axis=0)
-    white = (target.measured - predicted[0]) / target.noise
-    chi2 = np.array([np.mean(np.square(white[target.mask[:, k], k])) for k in range(len(joints))])
+    chi2 = found.chi2
     return [
         MissingTorque(
             joint=joint,

@@ -1,0 +1,121 @@
+"""How sure a name is: what the log prefers among all that was tried, and what is left where the named effect acts.
+
+Models are compared by their predictive density on stretches of the log (pseudo-BMA+ weights, Yao, Vehtari, Simpson and
+Gelman 2018, doi:10.1214/17-BA1091). What a model leaves is part of the likelihood: in each column an error of unknown
+size, estimated from what is left, that counts with as many independent samples as its autocorrelation leaves it. Many
+samples of a wrong model are therefore little evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.identify.refit import Fitted
+from sysid_btr.terms.effect import family_of
+
+if TYPE_CHECKING:
+    from sysid_btr.diagnosis.trials import Trial
+
+DRAWS = 400
+"""Bayesian bootstrap draws over stretches: a weight is known to 0.025 at worst."""
+LEAST_WEIGHT = 1e-3
+"""Weight of another name below which it is not mentioned; and how near to 0 and 1 a weight is believed."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for the name of one effect, among what was tried when it was added.
+
+    Attributes
+    ----------
+    rivals : effects that do nearly as well.
+    family, place : weight of all trials with an effect of this family, and of all at a place that this one is at.
+    others : weight of each other family that was tried.
+    """
+
+    rivals: tuple[str, ...] = ()
+    family: float = 1.0
+    place: float = 1.0
+    others: Mapping[str, float] = field(default_factory=dict)
+
+    def beside(self, present: Sequence[str]) -> Evidence:
+        """The same without rivals that are in the model themselves."""
+        return replace(self, rivals=tuple(r for r in self.rivals if r not in present))
+
+    def joined(self, other: Evidence) -> Evidence:
+        """Of one effect that was added in two rounds: what was said first, with the rivals of both."""
+        return replace(self, rivals=tuple(dict.fromkeys((*self.rivals, *other.rivals))))
+
+
+def evidence_of(winner: Trial, trials: Sequence[Trial], rivals: Sequence[str]) -> Evidence:
+    """What the log says of the name of the trial that was added, one of `trials`."""
+    finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
+    share = weights([t.fitted for t in finite], winner.fitted, [t.hypothesis.complexity for t in finite])
+    own, places = family_of(winner.hypothesis.effect), set(winner.hypothesis.places)
+    others: dict[str, float] = {}
+    family = place = 0.0
+    for trial, weight in zip(finite, share, strict=True):
+        name = family_of(trial.hypothesis.effect)
+        family += weight * (name == own)
+        place += weight * bool(places & set(trial.hypothesis.places))
+        if name != own:
+            others[name] = others.get(name, 0.0) + float(weight)
+    told = {name: weight for name, weight in others.items() if weight > LEAST_WEIGHT}
+    return Evidence(tuple(rivals), float(family), float(place), dict(sorted(told.items(), key=lambda x: -x[1])))
+
+
+def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -> FloatArray:
+    """Pseudo-BMA+ weights (m,) of models of the same data.
+
+    Parameters
+    ----------
+    models : fitted to the same data, with finite errors.
+    best : whose residuals say how many independent samples a column has.
+    parameters : (m,) that each has beside what all have; each costs as much as it gains by chance (Akaike 1974).
+    """
+    density = np.stack([_log_density(model, best) for model in models])
+    stretches = density.shape[1]
+    # a fixed seed: the draws are an integral, and the result is the same for the same data
+    shares = np.random.default_rng(0).dirichlet(np.ones(stretches), DRAWS)
+    total = stretches * shares @ density.T - np.asarray(parameters, dtype=np.float64)
+    odds = np.exp(total - total.max(axis=1, keepdims=True))
+    return np.asarray((odds / odds.sum(axis=1, keepdims=True)).mean(axis=0))
+
+
+def _log_density(model: Fitted, best: Fitted) -> FloatArray:
+    """Log density (stretches,) of all data under errors of the size that is left, in each column."""
+    parts = (
+        (model.train_cells, model.train_counts, model.train_columns, best.memory),
+        (model.holdout_cells, model.holdout_counts, model.holdout_columns, best.holdout_memory),
+    )
+    result = []
+    for cells, counts, chi2, memory in parts:
+        size = np.maximum(chi2, 1.0)[:, None]
+        each = counts * np.log(size) + cells / size
+        live = counts.sum(axis=0) > 0
+        result.append((-0.5 * each / memory[:, None]).sum(axis=0)[live])
+    return np.concatenate(result)
+
+
+def left_where_it_acts(without: Fitted, now: Fitted) -> float:
+    """Share of the excess, in the columns that an effect explains, that is left with it; 0 to 1.
+
+    Columns count by how much the effect improves their predictive density.
+    """
+    gain = np.maximum(without.columns - now.columns, 0.0)
+    left = np.maximum(now.columns - 1, 0.0)
+    weight = np.log(np.maximum(without.columns, 1e-300) / np.maximum(now.columns, 1e-300))
+    weight = np.maximum(weight, 0.0)
+    if not weight.sum() > 0:
+        return 1.0
+    return float(np.average(left / np.maximum(left + gain, 1e-300), weights=weight))
+
+
+def share_explained(without: float, now: float) -> float:
+    """Share of a chi2's excess over its noise floor that vanishes with an effect, 0 to 1."""
+    return float(np.clip((without - now) / max(without - 1, 1e-12), 0.0, 1.0))

@@ -1,0 +1,107 @@
+"""How sure a name is: closed forms of the weights, and what certainty must follow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sysid_btr.diagnosis.certainty import STANDARD
+from sysid_btr.diagnosis.evidence import left_where_it_acts, share_explained, weights
+from sysid_btr.identify.refit import Fitted
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.terms.model import Model
+
+COUNT = 50.0
+"""Samples in a stretch."""
+
+
+def left(chi2: np.ndarray, memory: float = 1.0) -> Fitted:
+    """What a model leaves that was held out: chi2 (columns, stretches) of samples with some autocorrelation."""
+    columns, counts = chi2.mean(axis=1), np.full(chi2.shape, COUNT)
+    nothing = np.zeros((len(chi2), 0))
+    return Fitted(
+        model=Model.of(()),
+        train=1.0,
+        holdout=float(columns.mean()),
+        train_columns=np.ones(len(chi2)),
+        holdout_columns=columns,
+        columns=columns,
+        memory=np.ones(len(chi2)),
+        holdout_memory=np.full(len(chi2), memory),
+        train_cells=nothing,
+        holdout_cells=chi2 * COUNT,
+        train_counts=nothing,
+        holdout_counts=counts,
+        evaluations=1,
+        numerics=Numerics("RK4", 0.005),
+    )
+
+
+def even(chi2: float, stretches: int = 20) -> np.ndarray:
+    return np.full((1, stretches), chi2)
+
+
+def test_models_that_leave_alike_weigh_alike_and_a_parameter_costs_what_it_gains_by_chance() -> None:
+    same = [left(even(2.0)), left(even(2.0))]
+    np.testing.assert_allclose(weights(same, same[0], [1, 1]), [0.5, 0.5])
+    np.testing.assert_allclose(weights(same, same[0], [1, 2]), [1 / (1 + np.exp(-1)), 1 / (1 + np.e)])
+
+
+def test_the_weight_of_a_clear_difference_is_that_of_the_likelihood() -> None:
+    # an error of unknown size: half the number of independent samples times the logarithm of the ratio of chi2
+    a, b = left(even(2.0), memory=100.0), left(even(2.1), memory=100.0)
+    odds = 0.5 * 20 * COUNT / 100 * np.log(2.1 / 2.0)
+    np.testing.assert_allclose(weights([a, b], a, [1, 1])[0], 1 / (1 + np.exp(-odds)), rtol=1e-6)
+
+
+def test_many_samples_of_a_wrong_model_are_little_evidence() -> None:
+    white, correlated = ([left(even(4.0), m), left(even(4.2), m)] for m in (1.0, 200.0))
+    assert weights(white, white[0], [1, 1])[0] > 0.999
+    assert weights(correlated, correlated[0], [1, 1])[0] < 0.6
+
+
+def test_a_lead_that_one_stretch_decides_is_less_sure_than_one_of_all_stretches() -> None:
+    steady, lucky = even(2.0), even(2.2)
+    lucky[0, 0] = 2.2 - 0.2 * 20  # the same chi2 as the steady one
+    other = left(even(2.2), memory=20.0)
+    firm = weights([left(steady, 20.0), other], other, [1, 1])[0]
+    chance = weights([left(np.maximum(lucky, 0.0), 20.0), other], other, [1, 1])[0]
+    assert firm > chance > 0.5
+
+
+@given(st.lists(st.floats(1.0, 50.0), min_size=2, max_size=6), st.integers(0, 5))
+def test_weights_are_a_distribution_and_do_not_depend_on_the_order(chi2: list[float], turn: int) -> None:
+    models = [left(even(c)) for c in chi2]
+    share = weights(models, models[0], [1] * len(models))
+    assert share.sum() == pytest.approx(1)
+    turned = models[turn % len(models) :] + models[: turn % len(models)]
+    np.testing.assert_allclose(np.roll(share, -(turn % len(models))), weights(turned, models[0], [1] * len(models)))
+
+
+def test_what_is_left_counts_where_the_effect_acts() -> None:
+    without = left(np.array([[101.0], [3.0], [1.0]]))
+    assert left_where_it_acts(without, left(np.array([[1.0], [3.0], [1.0]]))) == pytest.approx(0)
+    assert left_where_it_acts(without, left(np.array([[51.0], [3.0], [1.0]]))) == pytest.approx(0.5)
+    assert left_where_it_acts(without, without) == 1.0
+    assert share_explained(101.0, 51.0) == pytest.approx(0.5)
+    assert share_explained(1.0, 1.0) == 0.0
+    assert share_explained(2.0, 3.0) == 0.0
+
+
+KNOWN = {"family": 0.9, "place": 0.99, "left": 0.05}
+
+
+@pytest.mark.parametrize(("name", "better"), [("family", 0.99), ("left", 0.01)])
+def test_certainty_grows_with_what_speaks_for_a_name(name: str, better: float) -> None:
+    assert STANDARD.certainty({**KNOWN, name: better}) > STANDARD.certainty(KNOWN)
+    for extreme in (0.0, 1.0):
+        assert 0 < STANDARD.certainty({**KNOWN, name: extreme}) < 1
+
+
+def test_a_calibration_is_logistic() -> None:
+    flat = replace(STANDARD, constant=np.log(3.0), family=0.0, place=0.0, explained=0.0)
+    assert flat.certainty(KNOWN) == pytest.approx(0.75)
