@@ -107,6 +107,9 @@ def _explain(error: Exception) -> int:
         where = f" {error.filename}" if error.filename else ""
         remark(f"error: cannot write{where}: {error.strerror}; free some space, or choose a writable folder")
         return UsageError.exit_code
+    if isinstance(error, OSError) and error.filename:
+        remark(f"error: {str(error.filename)[:200]}: {error.strerror}; check the path")
+        return UsageError.exit_code
     remark(
         f"internal error: {type(error).__name__}: {error}\n"
         "This is a defect of sysid-btr, not of your data. Run the command again with --debug and report "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,11 +127,13 @@ def _tuple(_flag: str, given: list[Any]) -> tuple[Any, ...]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
+    return isinstance(value, str) and "\0" not in value
 
 
 def _is_list(value: Any) -> bool:
@@ -146,7 +149,8 @@ def _list(value: Any) -> list[str]:
 
 
 TEXT = Kind(str, "text", _is_text)
-WHOLE = Kind(int, "a whole number", lambda v: isinstance(v, int) and not isinstance(v, bool))
+MOST = 2**63
+WHOLE = Kind(int, "a whole number", lambda v: _is_number(v) and isinstance(v, int) and abs(v) < MOST)
 NUMBER = Kind(float, "a number", _is_number)
 FILE = Kind(Path, "text", _is_text)
 KINDS: dict[Any, Kind] = {

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tokenize import TokenError
 from zlib import crc32
 
 import numpy as np
@@ -226,7 +227,7 @@ class Journal:
             values: FloatArray = np.load(self._attachment_path(self.path, number), allow_pickle=False)
             if crc32(values.tobytes()) != self._tape.records[number].attached:
                 raise ValueError("it is not what was written")
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, SyntaxError, TokenError) as error:  # numpy parses the head of a file as Python
             raise UsageError(
                 f"{self._label}: the array that belongs to record {number + 1} cannot be read ({error}). "
                 "Start over with another journal (--overwrite)"

@@ -41,7 +41,7 @@ def read_urdf(path: Path, content: bytes) -> Urdf | None:
     Raises
     ------
     ModelError
-        Elements that stand twice in one place and differ; with all of them.
+        Elements that stand twice in one place and differ, with all of them; or what is no number where one must be.
     """
     try:
         root = ElementTree.fromstring(content)
@@ -49,8 +49,13 @@ def read_urdf(path: Path, content: bytes) -> Urdf | None:
         return None
     if root.tag != "robot":
         return None
-    remarks = [*_without_repeats(path, root), *_with_found_meshes(path, root), *_with_inertias(root)]
-    return Urdf(ElementTree.tostring(root, encoding="unicode"), tuple(remarks))
+    try:
+        remarks = [*_without_repeats(path, root), *_with_found_meshes(path, root), *_with_inertias(root)]
+        return Urdf(ElementTree.tostring(root, encoding="unicode"), tuple(remarks))
+    except (ValueError, OSError) as error:
+        raise ModelError(f"model {path}: a mass, an inertia or a mesh's name cannot be read: {error}") from error
+    except RecursionError:
+        raise ModelError(f"model {path}: its elements are nested too deeply") from None
 
 
 def _without_repeats(path: Path, root: ElementTree.Element) -> Iterator[str]:

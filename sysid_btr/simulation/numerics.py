@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 MUJOCO = "mujoco"
 """Name of the built-in simulator."""
+
+INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
+"""MuJoCo's."""
 
 
 @dataclass(frozen=True)
@@ -16,12 +20,24 @@ class Numerics:
     With `servo_period` (s, a multiple of the step) the servos compute their torque once a period and hold it;
     without, they act as MuJoCo's own do, at every evaluation of the dynamics. `simulator` is the name of what moves the
     model, see `simulation.registry`.
+
+    Raises
+    ------
+    ValueError
+        If a time is not above zero, or the built-in simulator has no such integrator.
     """
 
     integrator: str
     timestep: float
     servo_period: float | None = None
     simulator: str = MUJOCO
+
+    def __post_init__(self) -> None:
+        if self.simulator == MUJOCO and self.integrator not in INTEGRATORS:
+            raise ValueError(f"{self.integrator!r} is none of the integrators {', '.join(INTEGRATORS)}")
+        for seconds in (self.timestep, self.servo_period):
+            if seconds is not None and not 0 < seconds < math.inf:
+                raise ValueError(f"a step of {seconds} s")
 
     def halved(self) -> Numerics:
         return replace(self, timestep=self.timestep / 2)

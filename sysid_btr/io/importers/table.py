@@ -22,6 +22,7 @@ from sysid_btr.io.importers.mapping import TableRule
 from sysid_btr.io.importers.units import Unit, find
 from sysid_btr.io.log import LogMeta
 from sysid_btr.io.problem import explain
+from sysid_btr.memory import require_memory
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -33,6 +34,8 @@ SEPARATORS = (",", ";", "\t", "|")
 COMMENTS = ("#", "%", "//")
 CLOCKS = (("ms", 1e-3, 1.0, 200.0), ("us", 1e-6, 200.0, 2e5), ("ns", 1e-9, 2e5, np.inf))
 """Unit, factor, and the typical interval from and below which a clock is taken to count in it."""
+PIECE, TEXT = 1 << 24, 4.0
+"""Bytes that are unpacked at a time, and how often a text lies in memory while its table is read."""
 SLOW = 0.2
 """s; a joint log that slow deserves a remark."""
 _NUMBER = re.compile(r"\s*[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?\s*")
@@ -141,7 +144,7 @@ def _text(path: Path) -> str:
     try:
         content = path.read_bytes()
         if content.startswith(GZIP):
-            content = gzip.decompress(content)
+            content = _unpacked(path)
     except (OSError, EOFError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or error
         raise LogError(f"{path}: the file cannot be read ({reason})") from error
@@ -151,6 +154,17 @@ def _text(path: Path) -> str:
         return _decode(content)
     except ValueError as error:
         raise LogError(f"{path}: {error}") from error
+
+
+def _unpacked(path: Path) -> bytes:
+    """The content of a packed file, piece by piece: a small one may hold more than any memory."""
+    parts, size = [], 0
+    with gzip.open(path, "rb") as packed:
+        while part := packed.read(PIECE):
+            parts.append(part)
+            size += len(part)
+            require_memory(TEXT * size, f"{path}: the text packed in it", "cut the log", LogError)
+    return b"".join(parts)
 
 
 def _decode(content: bytes, strict: bool = True) -> str:
@@ -179,7 +193,11 @@ def _separator(line: str) -> str:
 def _fields(line: str, separator: str) -> list[str]:
     if separator == " ":
         return line.split()
-    return [f.strip() for f in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    try:
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    except csv.Error:  # a field longer than any name
+        fields = line.split(separator)
+    return [f.strip() for f in fields]
 
 
 def _header(path: Path, lines: Sequence[str], first: int, separator: str, rule: TableRule) -> tuple[list[str], int]:
