@@ -9,6 +9,7 @@ import os
 import pkgutil
 import subprocess
 import sys
+import traceback
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -86,7 +87,10 @@ def _run(options: argparse.Namespace) -> None:
         if options.seconds_budget is not None and perf_counter() - began > options.seconds_budget:
             return
         if options.workers == 1:
-            work(job)
+            try:
+                work(job)
+            except Exception:  # the others are still to be done
+                say(traceback.format_exc())
             return
         process = multiprocessing.get_context("spawn").Process(target=work, args=(job,))
         process.start()

@@ -261,8 +261,8 @@ def _places(rng: Generator, bench: Bench, recipe: Recipe, robot: Robot, taken: l
     if recipe.scope == "robot":
         return ()
     if recipe.scope == "body":
-        return (str(rng.choice([b for b in bench.loadable if b not in taken])),)
-    free = [j for j in robot.joints if j not in taken]
+        return (str(rng.choice([b for b in bench.loadable if b not in taken] or bench.loadable)),)
+    free = [j for j in robot.joints if j not in taken] or list(robot.joints)
     if recipe.scope == "two":
         a, b = sorted(int(i) for i in rng.choice(len(free), 2, replace=False))
         return free[a], free[b]

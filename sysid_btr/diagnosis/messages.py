@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from sysid_btr.diagnosis.closing import NamedEffect, Verdict
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import Scores
@@ -18,7 +20,9 @@ def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
     parts = []
     for i, group in enumerate(effect.groups):
         own = found[i * kinds : (i + 1) * kinds]
-        amounts = ", ".join(_amount(e, k.name, kinds > 1) for e, k in zip(own, effect.kinds, strict=True))
+        amounts = effect.in_words(group.partition(",")[0], np.array([e.value for e in own])) or ", ".join(
+            _amount(e, k.name, kinds > 1) for e, k in zip(own, effect.kinds, strict=True)
+        )
         parts.append(f"{_places(group.split(','))}: {amounts}")
     return f"{effect.title}: " + "; ".join(parts)
 

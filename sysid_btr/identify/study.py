@@ -265,7 +265,7 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
     Of a joint without a drive of its own (passive, coupled, pulled by a tendon) torques are those that its own motion
     takes of its inertia.
     """
-    torque, velocity, acceleration, span = [], [], [], []
+    torque, velocity, acceleration, ends, seconds = [], [], [], [], []
     measured: dict[str, list[FloatArray]] = {}
     for episode in episodes:
         log, replay = episode.log, episode.replay((), numerics, effort=True, threads=threads)
@@ -283,10 +283,12 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
         idle = (replay.index.actuator < 0) & ~np.any(np.abs(t) > TINY, axis=0)
         own = replay.model.dof_M0[replay.index.dof] * acceleration[-1]
         torque.append(np.where(idle, own, t))
-        span.append(np.nanmax(q, axis=0) - np.nanmin(q, axis=0))
+        ends.append((np.nanmin(q, axis=0), np.nanmax(q, axis=0)))
+        seconds.append(float(outputs.time[-1] - outputs.time[0]))
     model = robot.model
     t, v, a = (np.concatenate(x) for x in (torque, velocity, acceleration))
-    reach = np.max(span, axis=0)
+    reach = np.max([high - low for low, high in ends], axis=0)
+    centre = 0.5 * (np.min([low for low, _ in ends], axis=0) + np.max([high for _, high in ends], axis=0))
 
     def rms(x: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.nanmean(np.square(x), axis=0)))
@@ -304,6 +306,8 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
             slide=slides(model, joint),
             measured_rms=float(rms(asked)) if len(asked) else 0.0,
             measured_peak=float(np.max(np.abs(asked), initial=0.0)),
+            centre=float(centre[i]),
+            seconds=max(seconds),
         )
     return scales
 

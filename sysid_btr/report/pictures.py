@@ -63,6 +63,10 @@ CAPTIONS: Mapping[str, Caption] = {
         "Correlation of the held-out residual with itself (left) and with earlier commands (right). Inside the band "
         "it is that of white noise. A curve that leaves the band on the right is motion that the model lacks.",
     ),
+    "curves": Caption(
+        "Forms that were learnt",
+        "A torque that no law of the library gives, over what it depends on, with its 95 % interval at each point.",
+    ),
     "convergence": Caption("Progress of the search"),
     "predictive": Caption(
         "Posterior prediction of held-out data",
@@ -101,7 +105,9 @@ def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]
     """Names of an outcome's pictures and what draws them, in the order of the report."""
     from sysid_btr.identify.fit import Fit
     from sysid_btr.posterior.outcome import Posterior
+    from sysid_btr.report.curves import curves_of, plot_curves
     from sysid_btr.report.figures import figure_of, plot_convergence, plot_overlay, plot_residuals, trace_outcome
+    from sysid_btr.writeback.write import identified
 
     model = outcome.as_fit if isinstance(outcome, Posterior) else outcome
     traces = cache(lambda: trace_outcome(model))
@@ -112,6 +118,9 @@ def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]
         yield "predictive", lambda: figure_of(plot_bands(outcome))
         yield "corner", lambda: figure_of(plot_corner(outcome))
         yield "trace", lambda: figure_of(plot_trace(outcome))
+    final = identified(model)
+    if curves := curves_of(final.model, final.estimates):
+        yield "curves", lambda: figure_of(plot_curves(curves))
     yield "residuals", lambda: figure_of(plot_residuals(traces()))
     if isinstance(outcome, Fit):
         for profile in outcome.profiles:

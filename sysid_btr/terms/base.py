@@ -227,6 +227,7 @@ class Term:
     known : the parameters with the nominal values and bounds of a robot, once these are known.
     declared : name under which the user freed it; empty for what was added.
     fixed : value of every kind, None where it is free; empty where all are.
+    ranges : (places, 2) of the variable that its numbers are a function of; empty for most.
     """
 
     places: tuple[str, ...]
@@ -234,6 +235,7 @@ class Term:
     known: tuple[Parameter, ...] = ()
     declared: str = ""
     fixed: tuple[float | None, ...] = ()
+    ranges: tuple[tuple[float, float], ...] = ()
 
     name: ClassVar[str] = ""
     label: ClassVar[str] = ""
@@ -355,7 +357,11 @@ class Term:
         sizes = (largest_scale(scales, group) for group in bare.grouped)
         kinds = (bare.in_units_of(kind, slide=size.slide) for size in sizes for kind in cls.sized(size))
         known = tuple(parameter_of(kind, p.name) for kind, p in zip(kinds, bare.parameters, strict=True))
-        return replace(bare, known=known)
+        return replace(bare, known=known).over(scales)
+
+    def over(self, scales: Scales) -> Self:
+        """The same over the ranges that what it is a function of has at its places."""
+        return self
 
     # --- hooks, in the order in which a replay calls them -------------------------------------------------
 

@@ -179,7 +179,8 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
         kind = term.in_units_of(kind, slide=_slides(model, places[0]))
         own = parameter_of(replace(kind, lower=bounds[0], upper=bounds[1]), named)
         known.append(replace(own, stated=stated is not None))
-    return replace(term, known=tuple(known))
+    term = replace(term, known=tuple(known))
+    return term if scales is None else term.over(scales)
 
 
 def _slides(model: mujoco.MjModel, place: str) -> bool:

@@ -17,6 +17,7 @@ from sysid_btr.terms.disturbance import (
     ExternalDisturbanceTrain,
 )
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.friction import (
     CoulombFriction,
     LoadFriction,
@@ -93,6 +94,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     ExternalDisturbance,
     ExternalDisturbanceTrain,
     DriveDisturbanceTrain,
+    *FREE_FORMS,
     GravityTilt,
     FootFriction,
     FootCompliance,

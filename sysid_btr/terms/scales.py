@@ -21,6 +21,8 @@ class JointScale:
     slide : whether the joint is a slide.
     measured_rms, measured_peak : torque that the servo's law gives for the command and the measured position;
         far more than `torque_rms` where something holds the joint back. 0 where no position is logged.
+    centre : in the middle of the motion.
+    seconds : length of the longest log.
     """
 
     torque_rms: float
@@ -32,6 +34,8 @@ class JointScale:
     slide: bool = False
     measured_rms: float = 0.0
     measured_peak: float = 0.0
+    centre: float = 0.0
+    seconds: float = 10.0
 
     @property
     def damping(self) -> float:

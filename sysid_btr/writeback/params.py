@@ -94,7 +94,8 @@ def _term(
         problems.append(f"this version has no {entry['kind']} {name} {variant}".rstrip())
         return None
     fixed = tuple(None if v is None else float(v) for v in entry.get("fixed", ()))
-    bare = found(places=where, shared=bool(entry["shared"]), declared=declared, fixed=fixed)
+    ranges = tuple((float(low), float(high)) for low, high in entry.get("ranges", ()))
+    bare = found(places=where, shared=bool(entry["shared"]), declared=declared, fixed=fixed, ranges=ranges)
     unknown = [p for p in where if p not in places[bare.location]]
     if unknown:
         problems.append(f"{name}: the model has no {bare.location} {', '.join(unknown)}")

@@ -304,6 +304,7 @@ def params_of(model: Identified) -> dict[str, Any]:
                 "where": term.places,
                 "shared": term.shared,
                 **({"fixed": term.fixed} if term.fixed else {}),
+                **({"ranges": term.ranges} if term.ranges else {}),
                 "in_file": held.get(id(term), "yes"),
                 "parameters": [
                     {

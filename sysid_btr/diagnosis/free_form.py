@@ -1,0 +1,260 @@
+"""Where no law of the library fits: of which variable the missing torque is a smooth function, and which one.
+
+The torque that a model lacks is regressed on the curves of every free form (`sysid_btr.terms.free_form`) at its joint,
+which costs no replay; stretches of time that a curve did not see say how much of the torque it predicts. What is
+returned can be tried and refitted like any other hypothesis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.signal_features import FOLDS, line_shares, memory
+from sysid_btr.identify.missing_torque import MissingTorque
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.free_form import (
+    FREE_FORMS,
+    FreeFriction,
+    FreeFrictionLoad,
+    FreeFrictionPosition,
+    FreeFrictionSpeed,
+    FreeTorque,
+    FreeTorqueCommand,
+    FreeTorqueLoad,
+    FreeTorquePeriodic,
+    FreeTorquePosition,
+    FreeTorqueTime,
+    FreeTorqueVelocity,
+)
+from sysid_btr.terms.scales import JointScale, Scales, scale_at
+
+LOUD = 1.3
+"""Chi2 of a joint's position from which its torque is looked at, as for the signature."""
+WEAK = 0.2
+"""Share of the missing torque that a curve must predict, likewise."""
+NEARLY = 0.07
+"""A form that comes earlier is preferred if its share is within this of the best one's, likewise."""
+STRETCH, SHORT_STRETCH = 2.5, 0.5
+"""Seconds that are predicted from the others, for a function of a state, and of time, likewise."""
+SLOW = 0.05
+"""Velocity, relative to its rms, below which its sign is a matter of noise."""
+CYCLES = 3.0
+"""Periods that a log must hold for a torque to be periodic."""
+LINES = 3
+"""Frequencies that are tried."""
+FINER = 4
+"""Frequencies within one bin of the spectrum."""
+OWN_RHYTHM = 0.6
+"""Share of the velocity that one frequency explains, from which it is the motion's own."""
+MOST = 4096
+"""Samples of a regression."""
+ROUNDS = 8
+"""Of the estimate of how large a curve and its noise are."""
+
+VARIABLES: Mapping[type[FreeTorque], Callable[[MissingTorque], FloatArray]] = {
+    FreeFrictionSpeed: lambda m: m.velocity,
+    FreeFrictionLoad: lambda m: m.servo_measured,
+    FreeFrictionPosition: lambda m: m.position,
+    FreeTorquePosition: lambda m: m.position,
+    FreeTorqueVelocity: lambda m: m.velocity,
+    FreeTorqueLoad: lambda m: m.servo,
+    FreeTorqueCommand: lambda m: m.command,
+    FreeTorqueTime: lambda m: m.time,
+    FreeTorquePeriodic: lambda m: m.time,
+}
+"""What each form is a function of, as estimated beside the missing torque. Friction follows what the drive really
+gave; a torque must not, because a drive answers every disturbance."""
+OF_TIME = (FreeTorqueTime, FreeTorquePeriodic)
+
+
+@dataclass(frozen=True, eq=False)
+class FreeForm:
+    """A curve that predicts the missing torque of a joint.
+
+    Attributes
+    ----------
+    hypothesis : the term at its joint, and where its refit begins.
+    share : fraction of the missing torque that it predicts on stretches of time that it was not fitted to.
+    x : (n,) values of its variable (of one that is periodic: phases).
+    torque, low, high : (n,) Nm or N, and the 95 % interval at each value; of friction its level.
+    sentence : the finding in words.
+    """
+
+    hypothesis: Hypothesis
+    share: float
+    x: FloatArray
+    torque: FloatArray
+    low: FloatArray
+    high: FloatArray
+    sentence: str
+
+
+def free_forms(
+    problem: ReplayProblem, values: FloatArray, scales: Scales, missing: Sequence[MissingTorque]
+) -> tuple[FreeForm, ...]:
+    """Curves that predict what is missing: first the best one of each joint, then the others, by what they explain.
+
+    Parameters
+    ----------
+    problem, values : data and terms, and the (p,) numbers that left the torque; what terms have is not asked for again.
+    scales : sizes at the joints.
+    missing : the torques that they lack, as `missing_torques` estimates them.
+    """
+    loud = [m for m in missing if m.chi2 >= LOUD]
+    known = {(type(term), place) for term in problem.terms for place in term.places}
+    driven = frozenset(
+        j for e in problem.episodes for j, d in zip(e.replay.index.joints, e.replay.index.drive, strict=True) if d
+    )
+    best: list[FreeForm] = []
+    others: list[FreeForm] = []
+    for joint in dict.fromkeys(m.joint for m in loud):
+        own = [m for m in loud if m.joint == joint]
+        found = [
+            form
+            for effect in FREE_FORMS
+            if (effect, joint) not in known and (effect.scope == "joint" or joint in driven)
+            for form in _forms(effect, own, scale_at(scales, joint))
+            if form.share >= WEAK
+        ]
+        if found:
+            most = max(f.share for f in found)
+            chosen = next(f for f in found if f.share >= most - NEARLY)
+            best.append(chosen)
+            others += [f for f in found if f is not chosen]
+    return tuple(f for part in (best, others) for f in sorted(part, key=lambda f: -f.hypothesis.gain))
+
+
+def _forms(effect: type[FreeTorque], own: Sequence[MissingTorque], scale: JointScale) -> Iterator[FreeForm]:
+    """The form at a joint, if it can be one; of one that is periodic the best frequency."""
+    if effect not in OF_TIME:
+        yield _form(effect, own, scale, ())
+    elif len(own) > 1:
+        return  # the clocks of several logs have nothing to do with each other
+    elif effect is FreeTorqueTime:
+        yield _form(effect, own, scale, ())
+    else:
+        lines = [_form(effect, own, scale, (f,)) for f in frequencies(own[0])]
+        yield from sorted(lines, key=lambda f: -f.share)[:1]
+
+
+def _form(
+    effect: type[FreeTorque], own: Sequence[MissingTorque], scale: JointScale, more: tuple[float, ...]
+) -> FreeForm:
+    joint, ends = own[0].joint, effect.range_of(scale)
+    kinds = effect.sized(scale)
+    count = len(kinds) - len(more)
+    relative = np.array([k.upper for k in kinds[:count]]) / kinds[0].upper
+    seen, torque = [], []
+    for one in own:
+        rows = slice(None, None, -(-len(one.torque) // MOST))
+        seen.append(one.seen(design(effect, one, ends, *more))[rows])
+        torque.append(one.torque[rows])
+    block = SHORT_STRETCH if effect in OF_TIME else STRETCH
+    curve = _penalised(np.concatenate(torque), np.concatenate(seen), relative)
+    shares, weights = [], []
+    for one, columns, values in zip(own, seen, torque, strict=True):
+        power = float(np.mean(values**2))
+        real = max(power - one.noise**2, 0.05 * power)
+        samples = block / one.period * len(values) / len(one.torque)
+        predicted = _predicted_share(values, columns, curve, max(round(samples), 1))
+        shares.append(float(np.clip(predicted * power / real, 0.0, 1.0)))
+        weights.append((one.chi2 - 1.0) * len(one.residual))
+    share = float(np.average(shares, weights=weights))
+    start = np.clip([*curve.amounts, *more], np.array([k.lower for k in kinds]), np.array([k.upper for k in kinds]))
+    x = np.linspace(0.0, 1.0, 101) if more else np.linspace(*ends, 101)
+    modes = effect.modes_at(x, *ends)
+    line = modes @ curve.amounts
+    half = 1.96 * np.sqrt(np.einsum("nk,kl,nl->n", modes, curve.covariance, modes))
+    hypothesis = Hypothesis(effect, (joint,), False, start, share * float(sum(weights)))
+    term = effect.at((joint,), {joint: scale})
+    noun, _, rest = effect.title.partition(" that ")
+    article = "a " if noun == "torque" else ""
+    sentence = f"{article}{noun} at {joint} that {rest}: {term.in_words(joint, start)}"
+    return FreeForm(hypothesis, share, x, line, line - half, line + half, sentence)
+
+
+def design(
+    effect: type[FreeTorque], one: MissingTorque, ends: tuple[float, float], frequency: float = 1.0
+) -> FloatArray:
+    """(n, modes) torques of a form's modes along an estimate, each of rms 1 over its range."""
+    x = VARIABLES[effect](one)
+    modes = effect.modes_at(x * frequency if effect is FreeTorquePeriodic else x, *ends)
+    if not issubclass(effect, FreeFriction):
+        return modes
+    size = float(np.sqrt(np.mean(one.velocity**2)))
+    return np.asarray(-np.tanh(one.velocity / max(SLOW * size, 1e-300))[:, None] * modes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """Amounts (k,) of modes, their covariance (k, k), and what gave it: the prior's precision (k, k), noise squared."""
+
+    amounts: FloatArray
+    covariance: FloatArray
+    prior: FloatArray
+    noise: float
+
+
+def _penalised(torque: FloatArray, seen: FloatArray, relative: FloatArray) -> _Curve:
+    """Most probable amounts under the prior of the modes, whose size is the most likely one (EM).
+
+    The residual is correlated: its independent samples are fewer by its memory.
+    """
+    gram, inner = seen.T @ seen, seen.T @ torque
+    size = float(np.mean(torque**2))
+    noise = max(size, 1e-300)
+    for _ in range(ROUNDS):
+        prior, used = np.diag(1.0 / (relative**2 * max(size, 1e-300))), noise
+        covariance = np.linalg.inv(gram / used + prior)
+        amounts = covariance @ inner / used
+        rest = torque - seen @ amounts
+        noise = max(float(np.mean(rest**2)) * memory(rest), 1e-300)
+        size = float(np.mean((amounts**2 + np.diag(covariance)) / relative**2))
+    return _Curve(np.asarray(amounts), np.asarray(covariance), prior, used)
+
+
+def _predicted_share(torque: FloatArray, seen: FloatArray, curve: _Curve, block: int) -> float:
+    """Share of a torque that a curve predicts on stretches of `block` samples that it was not fitted to."""
+    fold = (np.arange(len(torque)) // block * 2) % FOLDS
+    left = 0.0
+    for k in range(FOLDS):
+        test = fold == k
+        own, rest = seen[~test], torque[~test]
+        amounts = np.linalg.solve(own.T @ own / curve.noise + curve.prior, own.T @ rest / curve.noise)
+        left += float(np.sum((torque[test] - seen[test] @ amounts) ** 2))
+    return 1.0 - left / max(float(np.sum(torque**2)), 1e-300)
+
+
+def frequencies(one: MissingTorque) -> tuple[float, ...]:
+    """Frequencies (Hz) of the strongest lines of the missing torque that are not the motion's own."""
+    from scipy.optimize import minimize_scalar
+
+    n = len(one.torque)
+    duration = n * one.period
+    if duration <= 0:
+        return ()
+    window = np.hanning(n)
+    spectrum = np.abs(np.fft.rfft((one.torque - one.torque.mean()) * window, FINER * n)) ** 2
+    at = np.fft.rfftfreq(FINER * n, one.period)
+    inner = np.arange(1, len(at) - 1)
+    peak = inner[(spectrum[inner] > spectrum[inner - 1]) & (spectrum[inner] >= spectrum[inner + 1])]
+    peak = peak[at[peak] * duration >= CYCLES]
+    found = []
+    for k in peak[np.argsort(-spectrum[peak])][:LINES]:
+        near = (float(at[k]) - 0.5 / duration, float(at[k]) + 0.5 / duration)
+        fine = minimize_scalar(lambda f: -_line(one.torque, one.time, f), bounds=near, method="bounded")
+        if _line(one.velocity, one.time, float(fine.x)) < OWN_RHYTHM:
+            found.append(float(fine.x))
+    return tuple(found)
+
+
+def _line(signal: FloatArray, time: FloatArray, frequency: float) -> float:
+    """Share of a signal's variance that a wave explains."""
+    angle = 2 * np.pi * frequency * time
+    wave = np.column_stack([np.sin(angle), np.cos(angle)])
+    return float(line_shares(signal, [wave], np.zeros((len(time), 0)))[0])

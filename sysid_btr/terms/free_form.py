@@ -1,0 +1,543 @@
+"""Torques of a form that is learnt: smooth functions of one thing that a joint does, or of time.
+
+Where no law of the library fits, a curve does: cubic B-splines over the range of the variable (de Boor 1978, "A
+Practical Guide to Splines"), whose numbers are the amounts of the modes of their roughness, the integral of the
+curve's squared second derivative, as in penalised splines (Eilers and Marx 1996, doi:10.1214/ss/1038425655). The
+first modes are a constant and a slope; each further one bends more, and its bounds are narrower in proportion to the
+root of its roughness. So the penalty is a prior, and any estimator can use it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.terms.base import BatchModel, Kind, Parameter, Step
+from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, scale_at
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
+
+SPLINES, PERIODIC = 8, 6
+"""Splines over a range, and over a period."""
+DEGREE = 3
+WAVES = (1, 2, 3)
+"""Sines and cosines in a period; of the last one splines have the cosine alone."""
+PERIODIC_BOUNDS = (1.0, 1.0, 1 / 4, 1 / 4, 1 / 9)
+"""Their bounds: the roughness of a wave's curve goes with the fourth power of its number."""
+EVEN = (np.arange(1000) + 0.5) / 1000
+WIDE = 3.0
+"""Range of a torque or a velocity, times its rms: peaks are too rare to tell a curve."""
+CREEP = 0.05
+"""Fraction of the fastest velocity below which velocities are told apart evenly, above by ratios."""
+FLAT = 0.15
+"""Change, relative to the whole, that is not worth a word."""
+FAMILY = "unknown torque"
+
+
+@cache
+def smooth_modes() -> BSpline:
+    """Modes over 0 .. 1, of rms 1 each: the least rough curve, the least rough that is orthogonal to it, and so on.
+
+    A call gives (..., SPLINES).
+    """
+    from scipy.interpolate import BSpline
+    from scipy.linalg import eigh
+
+    inner = np.linspace(0.0, 1.0, SPLINES - DEGREE + 1)
+    knots = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
+    splines = BSpline(knots, np.eye(SPLINES), DEGREE)
+    even, bent = splines(EVEN), splines(EVEN, nu=2)
+    gram = even.T @ even / len(even)
+    modes = eigh(bent.T @ bent / len(even) + 1e-3 * _slope(splines(EVEN, nu=1)), gram)[1]
+    return BSpline(knots, modes * np.where(modes[-1] < 0, -1.0, 1.0), DEGREE)
+
+
+def _slope(first: FloatArray) -> FloatArray:
+    """Roughness of slopes, which tells a slope from a constant."""
+    return np.asarray(first.T @ first / len(first))
+
+
+@cache
+def periodic_modes() -> BSpline:
+    """The same over a period of 1 and without the constant: (..., PERIODIC - 1), sines and cosines of splines."""
+    from scipy.interpolate import BSpline
+
+    turn = 2 * np.pi * np.arange(PERIODIC) / PERIODIC
+    waves = np.column_stack([f(n * turn) for n in WAVES for f in (np.sin, np.cos)][: PERIODIC - 2])
+    waves = np.column_stack([waves, np.cos(WAVES[-1] * turn)])
+    knots = np.arange(-DEGREE, PERIODIC + DEGREE + 1) / PERIODIC
+    whole = BSpline(knots, waves[np.arange(PERIODIC + DEGREE) % PERIODIC], DEGREE)
+    size = np.sqrt(np.mean(whole(EVEN) ** 2, axis=0))
+    return BSpline(knots, whole.c / size, DEGREE)
+
+
+def modal_bounds(count: int) -> tuple[float, ...]:
+    """Bounds of the modes over a range, relative to those of a constant and a slope: a free beam's, bent by its energy.
+
+    The roots of the roughness of a beam's modes are as the squares of 3, 5, 7, ... (within half a per cent).
+    """
+    return (1.0, 1.0, *((3.0 / (2 * k + 3)) ** 2 for k in range(count - 2)))
+
+
+def modal_sum(values: FloatArray, modes: FloatArray) -> FloatArray:
+    """Sum over the last axis, one by one: the same bits whatever candidates are beside."""
+    total = values[..., 0] * modes[..., 0]
+    for k in range(1, modes.shape[-1]):
+        total = total + values[..., k] * modes[..., k]
+    return np.asarray(total)
+
+
+def _kinds(bounds: Sequence[float], peak: float, size: float) -> tuple[Kind, ...]:
+    return tuple(Kind(f"c{k}", "Nm", 0.0, -w * peak, w * peak, w * size) for k, w in enumerate(bounds, start=1))
+
+
+def curve_in_words(x: FloatArray, y: FloatArray, across: str, unit: str) -> str:
+    """What a curve does: where it goes, if it goes one way, else what it lies between."""
+
+    def at(i: int) -> str:
+        return f"{y[i]:.2g} {unit} at {x[i]:.2g} {across}"
+
+    size, last = float(np.ptp(y)), len(y) - 1
+    if size <= FLAT * float(np.max(np.abs(y))):
+        return f"about {float(np.mean(y)):.2g} {unit} everywhere"
+    way = 1.0 if y[-1] > y[0] else -1.0
+    if float(np.sum(np.maximum(-way * np.diff(y), 0.0))) > FLAT * size:
+        low, high = sorted((int(np.argmin(y)), int(np.argmax(y))))
+        return f"from {at(low)} to {at(high)}, and back"
+    verb = "rises" if way > 0 else "falls"
+    if abs(y[0]) < FLAT * size:
+        return f"{verb} to {at(last)}"
+    return f"{verb} from {at(0)} to {at(last)}"
+
+
+@dataclass(frozen=True)
+class FreeTorque(Effect):
+    """Base: a torque on a joint that is a smooth function of one variable, of no form in particular.
+
+    Class attributes
+    ----------------
+    variable, variable_unit : in a sentence, and on an axis.
+    """
+
+    name: ClassVar[str] = "free_torque"
+    family: ClassVar[str] = FAMILY
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    law_acts: ClassVar[tuple[str, ...]] = ()
+    kinds: ClassVar[tuple[Kind, ...]] = _kinds(modal_bounds(SPLINES), 10.0, 0.05)
+    variable: ClassVar[str] = ""
+    variable_unit: ClassVar[str] = ""
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return _kinds(modal_bounds(SPLINES), 2 * scale.counter_peak, 0.1 * scale.torque_rms)
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        """What the variable covers at a joint."""
+        raise NotImplementedError
+
+    @classmethod
+    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        """Where in its range, 0 .. 1, the variable is; it stays at the ends beyond them."""
+        return np.minimum(np.maximum((x - low) / (high - low), 0.0), 1.0)
+
+    @classmethod
+    def modes_at(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        """(..., modes) of the curve at values of the variable."""
+        return np.asarray(smooth_modes()(cls.position_in(x, low, high)))
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        """All modes; the response is linear in them."""
+        kinds = cls.sized(scale)
+        return (tuple(tuple(k.scale if i == j else 0.0 for j, k in enumerate(kinds)) for i in range(len(kinds))),)
+
+    def curve(self, place: str, values: FloatArray, x: FloatArray) -> FloatArray:
+        """(n,) torque at values (n,) of the variable, from the numbers (kinds,) of a place."""
+        return modal_sum(np.broadcast_to(values, (len(x), len(values))), self.modes_of(place, x))
+
+    def modes_of(self, place: str, x: FloatArray) -> FloatArray:
+        """(n, modes) at values (n,) of the variable at a place."""
+        return self.modes_at(x, *self.ranges[self.places.index(place)])
+
+    def drawn_over(self, place: str) -> tuple[float, float]:
+        """Between which values of the variable the curve is drawn."""
+        return self.ranges[self.places.index(place)]
+
+    @property
+    def axes(self) -> tuple[str, str]:
+        """What is across and upwards in a drawing of the curve, with units."""
+        torque, across = self._units
+        variable = self.variable if across == "1" else f"{self.variable} ({across})"
+        return variable, f"{'torque' if torque == 'Nm' else 'force'} ({torque})"
+
+    @property
+    def _units(self) -> tuple[str, str]:
+        """Of the torque, and of the variable."""
+        own = self.parameters[0].unit
+        return own, self.variable_unit if own == "Nm" else SLIDE_UNITS.get(self.variable_unit, self.variable_unit)
+
+    def in_words(self, place: str, values: FloatArray) -> str:
+        unit, across = self._units
+        x = np.linspace(*self.drawn_over(place), 101)
+        return curve_in_words(x, self.curve(place, values, x), across, unit)
+
+    def over(self, scales: Scales) -> Self:
+        return replace(self, ranges=tuple(self.range_of(scale_at(scales, place)) for place in self.places))
+
+    @property
+    def _bounds(self) -> tuple[FloatArray, FloatArray]:
+        """(places,) ends of the ranges."""
+        table = np.array(self.ranges or [(-1.0, 1.0)] * len(self.places))
+        return table[:, 0], table[:, 1]
+
+
+@dataclass(frozen=True)
+class FreeTorqueOfState(FreeTorque):
+    """Base: the variable is one that only the replay knows."""
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        modes = self.modes_at(self.seen(step, index), *self._bounds)
+        step.joint_torque[:, index] += modal_sum(values, modes)
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        """(m, places) the variable at a step."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FreeTorquePosition(FreeTorqueOfState):
+    """A torque on a joint that is a smooth function of its position: a spring, a cable, a hose of any form.
+
+    Law: the curve at the position at the middle of each step.
+    """
+
+    variant: ClassVar[str] = "position"
+    label: ClassVar[str] = "free_torque.position"
+    title: ClassVar[str] = "torque that depends on the position"
+    variable: ClassVar[str] = "position"
+    variable_unit: ClassVar[str] = "rad"
+    includes: ClassVar[tuple[str, ...]] = ("joint_spring", "constant_force")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("joint_spring", "its line is straight"),
+        ("payload", "motion of other joints, which turns the weight and not the spring"),
+    )
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return scale.centre - 0.5 * scale.span, scale.centre + 0.5 * scale.span
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        return step.qpos[:, index]
+
+
+@dataclass(frozen=True)
+class FreeTorqueVelocity(FreeTorqueOfState):
+    """A torque on a joint that is a smooth function of its velocity: friction of any form but sticking.
+
+    Law: the curve at the velocity at the middle of each step; slow ones are told apart more finely.
+    """
+
+    variant: ClassVar[str] = "velocity"
+    label: ClassVar[str] = "free_torque.velocity"
+    title: ClassVar[str] = "torque that depends on the velocity"
+    variable: ClassVar[str] = "velocity"
+    variable_unit: ClassVar[str] = "rad/s"
+    includes: ClassVar[tuple[str, ...]] = ("viscous_damping", "quadratic_damping", "constant_force")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("coulomb_friction", "reversals: it holds the joint still, a curve does not"),
+        ("kv", "a logged effort or current"),
+    )
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        fastest = min(scale.velocity_peak, WIDE * scale.velocity_rms)
+        return -fastest, fastest
+
+    @classmethod
+    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        share = np.minimum(np.maximum(x / high, -1.0), 1.0) / CREEP
+        return np.asarray(0.5 + 0.5 * np.arcsinh(share) / np.arcsinh(1.0 / CREEP))
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        return step.qvel[:, index]
+
+
+@dataclass(frozen=True)
+class FreeTorqueLoad(FreeTorqueOfState):
+    """A torque on a joint that is a smooth function of its drive's torque, which gives more or less than it says.
+
+    Law: the curve at the drive's torque at the middle of each step.
+    """
+
+    scope: ClassVar = "drive"
+    variant: ClassVar[str] = "load"
+    label: ClassVar[str] = "free_torque.load"
+    title: ClassVar[str] = "torque that depends on load"
+    variable: ClassVar[str] = "load"
+    variable_unit: ClassVar[str] = "Nm"
+    includes: ClassVar[tuple[str, ...]] = ("torque_limit", "constant_force")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("kp", "a load that is large against the constant and the slope"),
+        ("torque_limit", "its corner"),
+    )
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        largest = min(scale.torque_peak, WIDE * scale.torque_rms)
+        return -largest, largest
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        return step.drive[:, index]
+
+
+@dataclass(frozen=True)
+class FreeTorqueCommand(FreeTorqueOfState):
+    """A torque on a joint that is a smooth function of its command.
+
+    Law: the curve at the command of each step.
+    """
+
+    scope: ClassVar = "servo"
+    variant: ClassVar[str] = "command"
+    label: ClassVar[str] = "free_torque.command"
+    title: ClassVar[str] = "torque that depends on the command"
+    variable: ClassVar[str] = "command"
+    variable_unit: ClassVar[str] = "rad"
+    includes: ClassVar[tuple[str, ...]] = ("constant_force",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("joint_spring", "fast motion, which parts both"),)
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return FreeTorquePosition.range_of(scale)
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        return step.command[:, index]
+
+
+@dataclass(frozen=True)
+class FreeTorqueTime(FreeTorque):
+    """A torque on a joint that is a smooth function of time: something from outside that comes and goes slowly.
+
+    Torque: the curve at the middle of each step.
+    """
+
+    family: ClassVar[str] = "disturbance"
+    variant: ClassVar[str] = "time"
+    label: ClassVar[str] = "free_torque.time"
+    title: ClassVar[str] = "torque that changes slowly with time"
+    variable: ClassVar[str] = "time"
+    variable_unit: ClassVar[str] = "s"
+    transient: ClassVar[bool] = True
+    includes: ClassVar[tuple[str, ...]] = ("constant_force",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("voltage_sag", "a load that is not always the same"),)
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return 0.0, scale.seconds
+
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
+        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        middle, (low, high) = 0.5 * (time[1:] + time[:-1]), self._bounds
+        for place, column in enumerate(batch.index.of(self.places)):
+            modes = self.modes_at(middle, low[place], high[place])
+            torque[:, :, column] += modal_sum(values[:, None, place], modes[None])
+        return torque
+
+
+@dataclass(frozen=True)
+class FreeTorquePeriodic(FreeTorque):
+    """A torque on a joint that repeats in time with a frequency of its own, in any smooth form.
+
+    The first two numbers are those of one wave, the root of two smaller than its amplitude.
+
+    Torque: the curve at the phase in the middle of each step.
+    """
+
+    family: ClassVar[str] = "disturbance"
+    variant: ClassVar[str] = "periodic"
+    label: ClassVar[str] = "free_torque.periodic"
+    title: ClassVar[str] = "torque that is periodic in time"
+    variable: ClassVar[str] = "phase"
+    variable_unit: ClassVar[str] = "1"
+    held: ClassVar[tuple[str, ...]] = ("frequency",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("external_disturbance", "its edges"),)
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        *_kinds(PERIODIC_BOUNDS, 10.0, 0.05),
+        Kind("frequency", "1/s", 1.0, 0.01, 100.0, 0.01),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return (*_kinds(PERIODIC_BOUNDS, 2 * scale.counter_peak, 0.1 * scale.torque_rms), cls.kinds[-1])
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return 0.0, scale.seconds
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        """None: only a residual says with which frequency."""
+        return ()
+
+    @classmethod
+    def modes_at(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        return np.asarray(periodic_modes()(np.mod(x, 1.0)))
+
+    def curve(self, place: str, values: FloatArray, x: FloatArray) -> FloatArray:
+        return super().curve(place, values[:-1], x)
+
+    def drawn_over(self, place: str) -> tuple[float, float]:
+        return 0.0, 1.0
+
+    def in_words(self, place: str, values: FloatArray) -> str:
+        y = self.curve(place, values, np.linspace(0.0, 1.0, 101))
+        wave = float(np.sqrt(2.0) * np.hypot(values[0], values[1]))
+        form = "" if abs(0.5 * float(np.ptp(y)) - wave) < FLAT * wave else ", not a sine"
+        return f"{0.5 * float(np.ptp(y)):.2g} {self.parameters[0].unit} at {float(values[-1]):.3g} Hz{form}"
+
+    def around(self, values: FloatArray) -> Self:
+        """The same with the frequency bounded near a guess: elsewhere are minima of its own."""
+        return replace(self, known=_near_frequency(self.parameters, values, len(self.kinds), self.ranges[0][1]))
+
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
+        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        middle = 0.5 * (time[1:] + time[:-1])
+        for place, column in enumerate(batch.index.of(self.places)):
+            modes = periodic_modes()(np.mod(values[:, place, -1, None] * middle, 1.0))
+            torque[:, :, column] += modal_sum(values[:, None, place], modes)
+        return torque
+
+
+def _near_frequency(
+    parameters: Sequence[Parameter], values: FloatArray, kinds: int, seconds: float
+) -> tuple[Parameter, ...]:
+    """Parameters whose frequencies may shift by half a cycle over the log."""
+    result = []
+    for i, parameter in enumerate(parameters):
+        if i % kinds == kinds - 1:
+            low, high = values[i] - 0.5 / seconds, values[i] + 0.5 / seconds
+            low = max(float(low), parameter.lower)
+            nominal = min(max(parameter.nominal, low), float(high))
+            parameter = replace(parameter, nominal=nominal, lower=low, upper=float(high), scale=0.05 / seconds)
+        result.append(parameter)
+    return tuple(result)
+
+
+@dataclass(frozen=True)
+class FreeFriction(FreeTorqueOfState):
+    """Base: dry friction whose level is a smooth function of one variable; what is below zero of it is none."""
+
+    name: ClassVar[str] = "free_friction"
+    family: ClassVar[str] = "friction"
+    law_acts: ClassVar[tuple[str, ...]] = ("friction",)
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
+
+    def curve(self, place: str, values: FloatArray, x: FloatArray) -> FloatArray:
+        return np.maximum(super().curve(place, values, x), 0.0)
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        modes = self.modes_at(self.seen(step, index), *self._bounds)
+        step.friction[:, index] += np.maximum(modal_sum(values, modes), 0.0)
+
+
+@dataclass(frozen=True)
+class FreeFrictionSpeed(FreeFriction):
+    """Dry friction that is a smooth function of speed: Stribeck's of any form, viscous, quadratic, or saturating.
+
+    Law: the level at the speed at the middle of each step; slow ones are told apart more finely.
+    """
+
+    variant: ClassVar[str] = "speed"
+    label: ClassVar[str] = "free_friction.speed"
+    title: ClassVar[str] = "friction that depends on speed"
+    variable: ClassVar[str] = "speed"
+    variable_unit: ClassVar[str] = "rad/s"
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction", "viscous_damping", "stribeck_friction")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("kv", "a logged effort or current"),)
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return 0.0, min(scale.velocity_peak, WIDE * scale.velocity_rms)
+
+    @classmethod
+    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        share = np.minimum(np.abs(x) / high, 1.0) / CREEP
+        return np.asarray(np.arcsinh(share) / np.arcsinh(1.0 / CREEP))
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        return step.qvel[:, index]
+
+
+@dataclass(frozen=True)
+class FreeFrictionLoad(FreeFriction):
+    """Dry friction that is a smooth function of the size of the drive's torque: a gear's, of any form.
+
+    Law: the level at the drive's torque at the middle of each step.
+    """
+
+    scope: ClassVar = "drive"
+    variant: ClassVar[str] = "load"
+    label: ClassVar[str] = "free_friction.load"
+    title: ClassVar[str] = "friction that depends on load"
+    variable: ClassVar[str] = "load"
+    variable_unit: ClassVar[str] = "Nm"
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction", "load_friction")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("coulomb_friction", "the same motion under different loads"),
+    )
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return 0.0, min(scale.torque_peak, WIDE * scale.torque_rms)
+
+    @classmethod
+    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        return np.asarray(np.minimum(np.abs(x) / high, 1.0))
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        return step.drive[:, index]
+
+
+@dataclass(frozen=True)
+class FreeFrictionPosition(FreeFriction):
+    """Dry friction that is a smooth function of the position: a bent shaft, a worn tooth, a seal.
+
+    Law: the level at the position at the middle of each step.
+    """
+
+    variant: ClassVar[str] = "position"
+    label: ClassVar[str] = "free_friction.position"
+    title: ClassVar[str] = "friction that depends on the position"
+    variable: ClassVar[str] = "position"
+    variable_unit: ClassVar[str] = "rad"
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("coulomb_friction", "motion over the whole range"),)
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return FreeTorquePosition.range_of(scale)
+
+    def seen(self, step: Step, index: IntArray) -> FloatArray:
+        return step.qpos[:, index]
+
+
+FREE_FORMS: tuple[type[FreeTorque], ...] = (
+    FreeFrictionSpeed,
+    FreeFrictionLoad,
+    FreeFrictionPosition,
+    FreeTorquePosition,
+    FreeTorqueVelocity,
+    FreeTorqueLoad,
+    FreeTorqueCommand,
+    FreeTorqueTime,
+    FreeTorquePeriodic,
+)
+"""All of them, in the order in which they are preferred where they explain as much."""

@@ -1,0 +1,179 @@
+"""Torques of a form that is learnt: curves by modes of splines, as terms, in files, in words and in a picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toys import robot_from_xml, swing
+
+from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.study import make_study
+from sysid_btr.report.curves import curves_of, plot_curves
+from sysid_btr.report.figures import figure_of
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.simulation.replay import Replay
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.disturbance import ConstantForce
+from sysid_btr.terms.free_form import (
+    EVEN,
+    FREE_FORMS,
+    FreeFrictionSpeed,
+    FreeTorque,
+    FreeTorqueLoad,
+    FreeTorquePeriodic,
+    FreeTorquePosition,
+    FreeTorqueTime,
+    FreeTorqueVelocity,
+    curve_in_words,
+    modal_bounds,
+    periodic_modes,
+    smooth_modes,
+)
+from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.model import Model
+from sysid_btr.terms.spring import JointSpring
+from sysid_btr.writeback.params import read_params
+from sysid_btr.writeback.write import Identified, params_of
+
+XML = """<mujoco><worldbody><body><joint name="knee" axis="0 1 0" damping=".1" armature=".01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".5"/></body></worldbody>
+<actuator><position joint="knee" kp="20" kv=".5"/></actuator></mujoco>"""
+ROBOT, LOG = robot_from_xml(XML), swing(("knee",), seconds=2.0)
+STUDY = make_study(ROBOT, [LOG], numerics=Numerics("implicitfast", 0.002), threads=1)
+
+
+def moved(term: Term, values: object) -> np.ndarray:
+    """Position under a term."""
+    replay = Replay(ROBOT, LOG, (term,), STUDY.numerics)
+    return np.asarray(replay.predict(np.atleast_2d(np.asarray(values, dtype=float))).position[0, :, 0])
+
+
+def fitted(term: FreeTorque, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Amounts whose curve is nearest to y(x)."""
+    return np.asarray(np.linalg.lstsq(term.modes_of("knee", x), y, rcond=None)[0])
+
+
+def at_knee(cls: type[FreeTorque]) -> FreeTorque:
+    return cls.at(("knee",), STUDY.scales)
+
+
+def test_modes_are_orthonormal_and_each_bends_more_than_the_one_before() -> None:
+    modes = smooth_modes()(EVEN)
+    np.testing.assert_allclose(modes.T @ modes / len(EVEN), np.eye(8), atol=1e-9)
+    np.testing.assert_allclose(modes[:, 0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(modes[:, 1], np.sqrt(12) * (EVEN - 0.5), atol=1e-4)
+    bent = np.sqrt(np.mean(smooth_modes()(EVEN, nu=2) ** 2, axis=0))
+    assert (np.diff(bent) > -1e-9).all()
+    np.testing.assert_allclose(np.array(modal_bounds(6))[2:] * bent[2:6], bent[2], rtol=0.05)  # as a free beam's
+
+
+def test_periodic_modes_close_and_the_first_two_are_one_wave() -> None:
+    modes = periodic_modes()
+    for order in (0, 1, 2):
+        np.testing.assert_allclose(modes(1e-12, nu=order), modes(1 - 1e-12, nu=order), atol=1e-6)
+    seen = modes(EVEN)
+    np.testing.assert_allclose(seen.T @ seen / len(EVEN), np.eye(5), atol=1e-9)
+    waves = np.column_stack([np.sin(2 * np.pi * EVEN), np.cos(2 * np.pi * EVEN)])
+    for target in waves.T:
+        near = seen[:, :2] @ (seen[:, :2].T @ target) / len(EVEN)
+        assert np.abs(near - target).max() < 0.02
+
+
+@pytest.mark.parametrize("cls", [FreeTorquePosition, FreeTorqueVelocity, FreeTorqueLoad, FreeTorqueTime])
+def test_a_flat_curve_is_a_constant_torque(cls: type[FreeTorque]) -> None:
+    flat = moved(at_knee(cls), [0.3, *[0.0] * 7])
+    np.testing.assert_allclose(flat, moved(ConstantForce.at(("knee",), STUDY.scales), [0.3]), atol=1e-6)
+
+
+def test_a_straight_curve_of_the_position_is_a_spring_and_beyond_its_range_it_stays() -> None:
+    term = at_knee(FreeTorquePosition)
+    ((low, high),) = term.ranges
+    x = np.linspace(low, high, 50)
+    amounts = fitted(term, x, -1.5 * (x - 0.1))
+    spring = JointSpring.at(("knee",), STUDY.scales)
+    values = [{"stiffness": 1.5, "rest": 0.1}[k.name] for k in spring.kinds]
+    np.testing.assert_allclose(moved(term, amounts), moved(spring, values), atol=1e-3)
+    beyond = term.curve("knee", amounts, np.array([high, high + 1.0]))
+    assert beyond[0] == beyond[1]
+
+
+def test_level_friction_that_does_not_depend_on_speed_is_dry_friction() -> None:
+    dry = moved(CoulombFriction.at(("knee",), STUDY.scales), [0.2])
+    np.testing.assert_allclose(moved(at_knee(FreeFrictionSpeed), [0.2, *[0.0] * 7]), dry, atol=1e-5)
+
+
+def test_friction_never_drives() -> None:
+    term = at_knee(FreeFrictionSpeed)
+    np.testing.assert_array_equal(moved(term, [-0.2, *[0.0] * 7]), moved(term, term.neutral))
+
+
+def test_a_periodic_torque_is_that_wave_at_its_frequency() -> None:
+    term = at_knee(FreeTorquePeriodic)
+    time = np.arange(0.0, 2.0, 0.001)
+    amounts = np.array([0.3, 0.3, 0.0, 0.0, 0.0, 3.7])
+    y = term.curve("knee", amounts, np.mod(3.7 * time, 1.0))
+    wave = np.column_stack([np.sin(2 * np.pi * 3.7 * time), np.cos(2 * np.pi * 3.7 * time)])
+    assert np.abs(y - wave @ np.linalg.lstsq(wave, y, rcond=None)[0]).max() < 0.02
+    assert term.in_words("knee", amounts) == "0.6 Nm at 3.7 Hz"
+    narrow = term.around(amounts).parameters[-1]
+    assert narrow.lower == pytest.approx(3.7 - 0.5 / STUDY.scales["knee"].seconds)
+
+
+def test_the_grammar_frees_a_curve_at_a_joint_over_what_the_joint_does() -> None:
+    (term,) = STUDY.declare(["free_torque.load:knee"])
+    assert isinstance(term, FreeTorqueLoad)
+    assert [p.name for p in term.parameters][:2] == ["free_torque.load.c1:knee", "free_torque.load.c2:knee"]
+    scale = STUDY.scales["knee"]
+    largest = min(scale.torque_peak, 3 * scale.torque_rms)
+    assert term.ranges == ((-largest, largest),)
+
+
+@pytest.mark.parametrize("cls", FREE_FORMS)
+def test_a_parameter_file_holds_the_range_of_a_curve(cls: type[FreeTorque], tmp_path: Path) -> None:
+    term = at_knee(cls)
+    model = Model.of([term], term.neutral + 0.1 * term.parameters[0].scale)
+    (tmp_path / "params.json").write_text(json.dumps(params_of(Identified(STUDY, model, (), ()))))
+    read = read_params(tmp_path / "params.json", ROBOT).model
+    assert read.terms[0].ranges == term.ranges
+    np.testing.assert_array_equal(read.values, model.values)
+
+
+@pytest.mark.parametrize(
+    ("y", "words"),
+    [
+        (lambda x: 0.1 * x**2, "rises to 0.4 Nm at 2 rad"),
+        (lambda x: 0.1 + 0.2 * x, "rises from 0.1 Nm at 0 rad to 0.5 Nm at 2 rad"),
+        (lambda x: -0.2 * x, "falls to -0.4 Nm at 2 rad"),
+        (lambda x: 0.3 + 0 * x, "about 0.3 Nm everywhere"),
+        (lambda x: x * (2 - x), "from 0 Nm at 0 rad to 1 Nm at 1 rad, and back"),
+    ],
+)
+def test_words_say_where_a_curve_goes(y: Callable[[np.ndarray], np.ndarray], words: str) -> None:
+    x = np.linspace(0.0, 2.0, 101)
+    assert curve_in_words(x, y(x), "rad", "Nm") == words
+
+
+def test_a_report_draws_the_curve_with_its_interval_at_every_point() -> None:
+    term = at_knee(FreeTorqueTime)
+    values = np.array([0.2, 0.1, *[0.0] * 6])
+    known = [
+        Estimate(p.name, p.unit, 0.0, v, 0.01, (0.0, 0.0), (p.lower, p.upper), "yes", at_bound=False, reason="")
+        for p, v in zip(term.parameters, values, strict=True)
+    ]
+    (curve,) = curves_of(Model.of([term], values), known)
+    np.testing.assert_allclose(curve.torque, term.curve("knee", values, curve.x))
+    size = 1.96 * 0.01 * np.sqrt(np.sum(term.modes_of("knee", curve.x) ** 2, axis=1))
+    np.testing.assert_allclose(curve.high - curve.torque, size)
+    axes = plot_curves([curve])
+    assert axes[0, 0].get_xlabel() == "time (s)"
+    assert figure_of(axes) is not None
+
+
+def test_position_of_the_toy_is_finite_under_every_form() -> None:
+    for cls in FREE_FORMS:
+        term = at_knee(cls)
+        assert np.isfinite(moved(term, term.neutral + [p.scale for p in term.parameters])).all()
