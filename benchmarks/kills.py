@@ -1,10 +1,10 @@
 """`python -m benchmarks.kills`: every verb killed at random moments, with a full disk, and with two writers; resumable.
 
 A command is killed (SIGKILL) at a moment that is drawn between its start and its usual end, and then given again: with
---resume where the verb has it, else with --overwrite. What it then writes must be what it writes undisturbed, to the bit,
-but for the time it took. A disk is full where no file may grow beyond some size, drawn too: the command must end with 2
-and one message, and leave what was there. Of two that write to one place at the same time one works, and the other is
-refused or writes the same.
+--resume where the verb has it, else with --overwrite. What it then writes must be what it writes undisturbed, to the
+bit, but for the time it took. A disk is full where no file may grow beyond some size, drawn too: the command must end
+with 2 and one message. Of two that write to one place at the same time one works, and the other is refused or writes
+the same.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def undisturbed(command: Command) -> Whole:
 
 
 def after_a_kill(command: Command, whole: Whole, share: float) -> tuple[bool, str]:
-    """Kill a command after a share of its time and give it again: whether that was before its end, and what is wrong."""
+    """Kill a command after a share of its time and give it again: whether it was killed, and what is wrong."""
     with TemporaryDirectory() as folder:
         _prepare(command, folder)
         process = subprocess.Popen(

@@ -11,14 +11,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.fuzz.cases import Ending, ending, run_case
 from benchmarks.fuzz.examples import LOG, MODEL, SAMPLES, Example, make_examples
+from benchmarks.fuzz.truth import SPOILT, answer, fitted, recorded
 from sysid_btr.io._file import parse_meta
 from sysid_btr.io.problem import Problem
+from sysid_btr.models.builtin import load_robot
 
 COSTLY = {"journal": 12}
 """Cases of formats whose reading is followed by work."""
@@ -110,6 +113,13 @@ def test_any_json_is_a_result_or_refused(content: Any) -> None:
     for key in ("parameters", "nominal", "model", "numerics", "misfit"):
         files = {"run/result.json": json.dumps({**result, key: content}).encode()}
         assert not in_a_folder(Example("result", files, (), {}), ("report", "run")).wrong
+
+
+@pytest.mark.parametrize("kind", ["nothing", "ten times the noise", "30 % missing", "30 ms late", "a scale of 1.1"])
+def test_no_answer_is_sure_and_wrong(kind: str) -> None:
+    robot = load_robot(str(SAMPLES / MODEL))
+    log = SPOILT[kind](recorded(robot, 3), np.random.default_rng(3))
+    assert "WRONG" not in answer(robot, log, fitted)
 
 
 def test_the_examples_are_the_samples() -> None:
