@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -231,6 +232,24 @@ def test_rough_loss_stalls_or_converges_but_does_not_wander() -> None:
     wanted = run(LeastSquares(), smooth)
     assert result.evaluations < 400
     assert result.loss < 1.1 * wanted.loss
+
+
+def test_residuals_that_count_for_less_than_one_end_at_a_tenth_of_a_standard_deviation() -> None:
+    """Copies of one residual, weighed so that together they are one: no sharper end than for that one."""
+    copies = 400
+    once = exponential_decay(np.random.default_rng(0), noise=0.02)
+
+    @dataclass(frozen=True, eq=False)
+    class Correlated(ToyProblem):
+        deviation: ClassVar[float] = 1.0
+
+    def function(x: FloatArray) -> FloatArray:
+        return np.tile(once.function(np.round(x, 3)) / np.sqrt(copies), copies)
+
+    correlated = Correlated(once.names, once.lower, once.upper, once.start, function, once.optimum)
+    result = run(LeastSquares(), correlated, evaluations=None)
+    assert result.termination is Termination.CONVERGED
+    assert result.loss < run(LeastSquares(), once).loss + 0.1
 
 
 def test_several_starts_escape_a_local_minimum() -> None:

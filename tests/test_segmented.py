@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from toys import PENDULUM, pendulum, robot_from_xml, swing
 
+from sysid_btr.diagnosis.search import leading_hypotheses
+from sysid_btr.diagnosis.selection import STANDARD
+from sysid_btr.diagnosis.state import State
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.fit import Fit, fit
@@ -22,6 +25,8 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
+from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.sensing import TorqueScale
 from sysid_btr.terms.servo import CommandDelay
 
 TWO = """<mujoco><worldbody>
@@ -136,6 +141,35 @@ def test_sizes_at_the_joints_are_finite_where_the_plain_model_diverges() -> None
 def test_the_step_is_judged_on_segments_that_errors_do_not_outgrow() -> None:
     study = make_study(double_pendulum(), [driven()], threads=1)
     assert study.numerics.timestep >= 0.001
+
+
+def test_a_clock_that_jitters_does_not_make_the_step_short() -> None:
+    """A start between two borders of steps is an error of the start, which is integrated out."""
+    log = driven(jitter=0.4)
+    square = {f"command.{j}": 0.3 * np.sign(log.channels[f"command.{j}"]) for j in JOINTS}
+    episode = SegmentedEpisode.whole(double_pendulum(), replace(log, channels=log.channels | square), 1, seconds=0.4)
+    _, change = episode.choose_numerics(1)
+    assert change <= 0.02
+
+
+def test_friction_is_bounded_by_the_motion_where_the_motor_is_asked_for_nothing() -> None:
+    log = driven(torque=QUIET, seconds=2.0)
+    still = replace(log, channels=log.channels | {"command.elbow": np.zeros(len(log))})
+    scales = make_study(double_pendulum(), [still], numerics=Numerics("RK4", 0.005), threads=1).scales
+    assert scales["elbow"].counter_peak > FRICTION
+
+
+def test_columns_count_in_a_scan_by_what_is_left_in_them_on_its_short_segments() -> None:
+    """Sensors that show 0.8 of the torque must not hide the friction that both joints lack."""
+    log = driven()
+    rng = np.random.default_rng(1)
+    shown = {f"effort.{j}": 0.8 * log.channels[f"command.{j}"] + rng.normal(scale=1e-3, size=len(log)) for j in JOINTS}
+    with_effort = replace(log, channels=log.channels | shown)
+    study = make_study(double_pendulum(), [with_effort], numerics=Numerics("RK4", 0.005), threads=1)
+    state = State.of(fit(study, ["mass:*"]), None)
+    found, _ = leading_hypotheses(state, (CoulombFriction, TorqueScale), STANDARD)
+    gain = {effect: max(h.gain for h in found if h.effect is effect) for effect in (CoulombFriction, TorqueScale)}
+    assert gain[CoulombFriction] > STANDARD.hopeless * gain[TorqueScale]
 
 
 def test_where_open_loop_holds_segments_give_the_same_answer() -> None:

@@ -141,6 +141,12 @@ def where_something_is(
     return [q for q in costly if len(q.places) > 1 or best.get(q.place, least) >= least]
 
 
+def explained_by(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """The part (r,) of a residual that parameters explain, to first order, whatever their bounds."""
+    basis = _orthonormal(jacobian)
+    return np.asarray(basis @ (basis.T @ residual))
+
+
 def _orthonormal(jacobian: FloatArray) -> FloatArray:
     """Orthonormal basis of what the declared parameters can do."""
     norm = np.linalg.norm(jacobian, axis=0)

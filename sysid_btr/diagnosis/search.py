@@ -13,7 +13,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.elimination import without_dispensable
 from sysid_btr.diagnosis.evidence import evidence_of
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
-from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, perturbations, scan
+from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, explained_by, perturbations, scan
 from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain
 from sysid_btr.diagnosis.signature import proposals
 from sysid_btr.diagnosis.state import State
@@ -30,11 +30,13 @@ from sysid_btr.diagnosis.trials import (
 from sysid_btr.estimators.base import Progress
 from sysid_btr.estimators.journal import Record
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.refit import refit, robust_refit, shorten
+from sysid_btr.identify.refit import inflate, judge, refit, robust_refit, shorten
+from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import body_names, joint_names
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.base import Scope
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.model import Model
 
 Library = Sequence[type[Effect]]
 Say = Callable[[str], None]
@@ -69,7 +71,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
 def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:
     """Refit the hypotheses of a scan, the most promising first, while they may matter."""
     say("scan")
-    hypotheses, answers = _promising(state, library, rules)
+    hypotheses, answers = leading_hypotheses(state, library, rules)
     state = state.spent(answers)
     trials: list[Trial] = []
     for hypothesis in hypotheses:
@@ -111,7 +113,7 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
     return state.step(added=(str(hypothesis),))
 
 
-def _promising(state: State, library: Library, rules: Selection) -> tuple[list[Hypothesis], int]:
+def leading_hypotheses(state: State, library: Library, rules: Selection) -> tuple[list[Hypothesis], int]:
     """The leading hypotheses of a scan, and how many perturbations were simulated; an interrupted run noted them."""
     study, values = state.study, state.fitted.model.values[None]
     places = (*joint_names(study.robot), *body_names(study.robot), "robot")
@@ -133,7 +135,7 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     study, model = state.study, state.fitted.model
     if study.procedure.shares:
         # what is missing acts in proportion on short segments alone
-        study = study.with_share(study.procedure.shares[0], model)
+        study = _weighed(study.with_share(study.procedure.shares[0], model), model)
     problem = shorten(study, rules.scan_seconds).train_problem(model)
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
     asked = _perturbations(state, library, problem, residual, rules)
@@ -154,6 +156,14 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     return found, len(residual)
 
 
+def _weighed(study: Study, model: Model) -> Study:
+    """The study with columns that count by what the model's own parameters leave in them, to first order."""
+    problem = study.train_problem(model)
+    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
+    left = residual - explained_by(jacobian, residual)
+    return inflate(study, replace(judge(study, model), train_columns=problem.column_chi2(left)))
+
+
 def _perturbations(
     state: State, library: Library, problem: ReplayProblem, residual: FloatArray, rules: Selection
 ) -> list[Perturbation]:
@@ -164,7 +174,7 @@ def _perturbations(
     if rules.alike:
         asked = [q for q in asked if len(q.places) > 1 or q.effect.scope == "robot"]
     else:
-        asked += proposals(study, problem, state.fitted.model.values, residual, library)
+        asked += proposals(study, problem, problem.start, residual, library)
     terms = state.fitted.model.terms
     present = {(type(t), p) for t in terms if t.numbers == t.kinds for p in t.places}
     split = {p for t in terms if t.structural for p in t.places}

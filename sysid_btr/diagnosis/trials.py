@@ -24,10 +24,16 @@ class Trial:
 
 
 def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
-    """The model with a hypothesis added, refitted from the best of its initial guesses."""
+    """The model with a hypothesis added, refitted from the best of its initial guesses.
+
+    What was fitted without it may have taken its part: where that leads far away, the others' nominal values are tried
+    too.
+    """
     guesses = hypothesis.initial_guesses()
     terms = rest.with_(hypothesis.term(study.scales), guesses[0]).terms
     starts = np.column_stack([np.tile(rest.values, (len(guesses), 1)), guesses])
+    if study.procedure.wanders:
+        starts = np.vstack([starts, np.column_stack([np.tile(rest.terms.nominal, (len(guesses), 1)), guesses])])
     seconds = rules.refit_seconds if len(starts) <= rules.start_few else rules.start_seconds
     spent = 0
     while True:

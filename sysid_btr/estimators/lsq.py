@@ -152,7 +152,7 @@ class _Scheme:
 class _Linear:
     """The quadratic model of the loss about one point of the unit cube.
 
-    ``loss(u + d) ~ loss + 2 gradient.d + d.normal.d``
+    ``loss(u + d) ~ loss + 2 gradient.d + d.normal.d``; `deviation` is what one standard deviation is worth.
     """
 
     loss: float
@@ -161,6 +161,7 @@ class _Linear:
     failed: BoolArray
     faint: BoolArray
     residuals: int
+    deviation: float
     neighbour: tuple[FloatArray, float]
     attachment: Callable[[], FloatArray]
 
@@ -220,7 +221,8 @@ class LeastSquares:
     tolerance
         Converged when the decrease of the loss that the linear model still promises is below this fraction of
         the loss. Where the residuals are so many that this would leave a step longer than a tenth of a
-        standard deviation, it is tightened to that.
+        standard deviation, it is tightened to that. A standard deviation is worth the mean squared residual, or
+        the problem's `deviation` where it has one and that is more.
     step_tolerance
         Converged when the Gauss-Newton step is shorter than this fraction of every parameter's range.
     forward_step, central_step
@@ -380,13 +382,15 @@ class LeastSquares:
                 )
             full = model.step(0.0, -u, 1.0 - u, scheme.rank_tolerance)
             promised = model.predicted(full)
+            # of correlated residuals, which count less, a standard deviation is more than their mean square
             tolerance = min(self.tolerance, self.least_gain / model.residuals)
+            tolerance *= max(1.0, model.deviation * model.residuals / max(loss, np.finfo(float).tiny))
             short = bool(np.max(np.abs(full)) < self.step_tolerance)
             if short or promised <= tolerance * loss or slow == 2:
                 there = halted if slow == 2 else Termination.CONVERGED
                 return _Point(u, loss, steps, Termination.STALLED if model.failed.any() else there, model)
             found = _climb(evaluator, model, u, loss, scheme.rank_tolerance, ladder, note)
-            rough = promised <= max(_ROUGH_FRACTION, 4 * self.least_gain) / model.residuals * loss
+            rough = promised <= max(_ROUGH_FRACTION, 4 * self.least_gain) * model.deviation
             rough |= promised <= tolerance * loss
             halted = Termination.CONVERGED if rough and not model.failed.any() else Termination.STALLED
             stumbled = found is None and model.neighbour[1] < (1.0 - tolerance) * loss
@@ -410,7 +414,7 @@ class LeastSquares:
         """Gain below which a step that promised more tells of a rough objective."""
         if model.residuals < _MANY:
             return 0.0
-        worth = max(_SLOW_FRACTION, self.least_gain) / model.residuals * model.loss
+        worth = max(_SLOW_FRACTION, self.least_gain) * model.deviation
         return _KEPT * promised if stumbled else min(worth, _KEPT * promised)
 
     def _ladder(self, centre: float, *, trust: bool) -> tuple[FloatArray, ...]:
@@ -518,13 +522,15 @@ def _simulate_stencil(
     change = np.sqrt(np.diag(gram)[:-1]) * np.abs(stencil.offsets).max(axis=1)
     loss = float(reduced.loss[0])
     nearest = int(np.argmin(reduced.loss))
+    residuals = int(reduced.arrays["size"][0])
     return _Linear(
         loss=loss,
         gradient=gram[:-1, -1],
         normal=gram[:-1, :-1],
         failed=failed,
         faint=change < _SMALLEST_CHANGE * np.sqrt(loss),
-        residuals=int(reduced.arrays["size"][0]),
+        residuals=residuals,
+        deviation=max(loss / residuals, float(getattr(problem, "deviation", 0.0))),
         neighbour=(np.clip(points[nearest], 0.0, 1.0), float(reduced.loss[nearest])),
         attachment=reduced.attachment,
     )

@@ -52,6 +52,11 @@ class Corrected(Derived):
         return self.point
 
     @property
+    def deviation(self) -> float:
+        """See `ReplayProblem.deviation`."""
+        return self.problem.deviation
+
+    @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """See `ReplayProblem.groups`."""
         return self.problem.groups

@@ -76,6 +76,8 @@ class Procedure:
     refines_step : whether half the step, where that moves an estimate, is nearer to the truth.
     weighs_segments : whether segments are weighed one by one, by what is left in them under the columns' noise.
     moves_split : whether the end of the fitted part can be moved.
+    wanders : whether parameters may be fitted far from where they belong where something is missing, as errors of the
+        model grow in a replay.
     fuses : whether `fuse` has more to say than the residuals.
     costly : whether each candidate is a simulation of its own, so that fewer are asked for.
     leaves_ground_error : whether the right model leaves an error that no effect explains: that of its ground.
@@ -93,6 +95,7 @@ class Procedure:
     refines_step: ClassVar[bool] = True
     weighs_segments: ClassVar[bool] = False
     moves_split: ClassVar[bool] = True
+    wanders: ClassVar[bool] = False
     fuses: ClassVar[bool] = False
     costly: ClassVar[bool] = False
     leaves_ground_error: ClassVar[bool] = False

@@ -32,6 +32,7 @@ from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import SegmentReplay, Segments, covered, segment_seconds, spread_evenly
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.base import Term
+from sysid_btr.terms.model import Terms
 
 WIDENED = 2.0
 """Factor on the smoother's standard deviations: it has used the segment's own samples as well."""
@@ -61,6 +62,7 @@ class SegmentedProcedure(Procedure):
     alternations: ClassVar[tuple[int, ...]] = (5, 5, 5)
     shares: ClassVar[tuple[float, ...]] = SHARES
     moves_split: ClassVar[bool] = False
+    wanders: ClassVar[bool] = True
     no_torque: ClassVar[str] = "segments are too short"
 
     def cheap(self, numerics: Numerics) -> Numerics:
@@ -169,24 +171,27 @@ class SegmentedEpisode(Episode):
         return found
 
     def choose_numerics(self, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
-        """As for a whole replay, judged over segments as short as those of first fits.
+        """As for a whole replay, judged over segments as short as those of first fits, their starts integrated out.
 
         What a step does wrong grows along long ones as every other error does, which a fit answers for (`step_check`).
+        A start between two borders of steps is taken back to the first one, which is an error of the start.
         """
         if self.log.meta.servo_period:
             return choose_numerics(self.robot, self.log, threads, simulator)
+        first, plain = largest_step(self.log, simulator), np.zeros((1, 0))
         short = self.with_share(SHARES[0])
         which = np.unique(np.linspace(0, len(short.segments) - 1, CHECKED).astype(np.int64))
         few = replace(short, segments=short.segments.chosen(which))
-        inside = covered(few.segments, len(self.log))
+        few = replace(few, marginal=respond(few.replay((), first, threads=threads), plain[0]))
 
-        def positions(numerics: Numerics) -> dict[str, FloatArray]:
-            replay = few.replay((), numerics, threads=threads)
+        def errors(numerics: Numerics) -> dict[str, FloatArray]:
+            compared = few.compare(Terms(()), ("position",), numerics, threads=threads)
+            target = compared.targets[0]
             with silenced():
-                found = replay.predict(np.zeros((1, 0))).position[0, inside]
-            return {j: found[:, i] for i, j in enumerate(replay.index.joints) if self.log.has("position", j)}
+                found = compared.errors(compared.replay.predict(plain))[0]
+            return {j: found[target.mask[:, k], k] for k, j in enumerate(target.joints)}
 
-        chosen, error = converged(largest_step(self.log, simulator), positions, self.log)
+        chosen, error = converged(first, errors, self.log)
         if not np.isfinite(error):
             raise ModelError(
                 f"model {self.robot.name}: segments of {segment_seconds(few.segments, self.log):.3g} s of "

@@ -262,8 +262,8 @@ def _refuse_repeats(recordings: Iterable[Log]) -> None:
 def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics, threads: int = 0) -> Scales:
     """Sizes at every joint, from replays of the plain model.
 
-    Of a joint without a drive of its own (passive, coupled, pulled by a tendon) torques are those that its own motion
-    takes of its inertia.
+    Of a joint that no drive of its own moves (passive, coupled, pulled by a tendon, or a motor that is asked for
+    nothing) torques are those that its own motion takes of its inertia.
     """
     torque, velocity, acceleration, ends, seconds = [], [], [], [], []
     measured: dict[str, list[FloatArray]] = {}
@@ -280,7 +280,7 @@ def measure_scales(robot: Robot, episodes: Sequence[Episode], numerics: Numerics
             measured.setdefault(joint, []).append(asked)
         velocity.append(v)
         acceleration.append(_rate(v, time, episode.breaks - skip))
-        idle = (replay.index.actuator < 0) & ~np.any(np.abs(t) > TINY, axis=0)
+        idle = ~np.any(np.abs(t) > TINY, axis=0)
         own = replay.model.dof_M0[replay.index.dof] * acceleration[-1]
         torque.append(np.where(idle, own, t))
         ends.append((np.nanmin(q, axis=0), np.nanmax(q, axis=0)))

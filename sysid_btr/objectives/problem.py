@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -96,11 +96,14 @@ class ReplayProblem:
     episodes : replays under the same parameters.
     start : (p,) where a search begins.
     executor : where candidates are simulated.
+    deviation : decrease of the loss that one standard deviation is worth at least: residuals are in units of their
+        noise, and less than one where columns are correlated and count less for it.
     """
 
     episodes: tuple[Comparison, ...]
     start: FloatArray
     executor: Executor = HERE
+    deviation: ClassVar[float] = 1.0
 
     def __getstate__(self) -> dict[str, Any]:
         """What another process needs; it simulates there."""
