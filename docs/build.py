@@ -108,9 +108,9 @@ def effects_page() -> str:
         "All of them can be freed: `--fit NAME:GLOB`, or `--fit NAME.PARAMETER:GLOB` for one parameter alone. The name "
         "of a model's own value stands for that value instead of a change of it.",
         "",
-        "`free_torque` and `free_friction` have no law: they are smooth curves over one variable, which is named after "
-        f"a point, as in `--fit free_torque.load:*Knee`: {', '.join(f'`{e.label}`' for e in FREE_FORMS)}. The report "
-        "draws them. A model in MJCF cannot hold them; `params.json` does.",
+        "`free_torque`, `free_friction` and `free_reading` have no law: they are smooth curves over a variable, named "
+        f"after a point, as in `--fit free_torque.load:*Knee`: {', '.join(f'`{e.label}`' for e in FREE_FORMS)}. The "
+        "report draws them. A model in MJCF cannot hold them; `params.json` does.",
         "",
         "| name | other names | what | at | parameters (unit) | mistaken for, unless the log has |",
         "|---|---|---|---|---|---|",

@@ -32,15 +32,15 @@ XML = """<mujoco><worldbody><body><joint name="RKnee" axis="0 1 0" damping=".1" 
 ROBOT, LOG, NUMERICS = robot_from_xml(XML), swing(("RKnee",), seconds=8.0), Numerics("implicitfast", 0.002)
 
 
-def study_of(model: Model) -> Study:
-    """A recording of the robot with what a model adds."""
+def study_of(model: Model, logs: int = 1) -> Study:
+    """Recordings of the robot with what a model adds."""
     outputs = Replay(ROBOT, LOG, model.terms, NUMERICS).predict(model.values[None])
-    noise = np.random.default_rng(0).normal(0.0, 5e-4, len(LOG))
-    log = replace(LOG, channels={**LOG.channels, "position.RKnee": outputs.position[0, :, 0] + noise})
-    return make_study(ROBOT, [log], numerics=NUMERICS, threads=1)
+    positions = (outputs.position[0, :, 0] + np.random.default_rng(k).normal(0.0, 5e-4, len(LOG)) for k in range(logs))
+    recordings = [replace(LOG, channels={**LOG.channels, "position.RKnee": p}) for p in positions]
+    return make_study(ROBOT, recordings, numerics=NUMERICS, threads=1)
 
 
-STUDY = study_of(Model.of(()))
+STUDY = study_of(Model.of(()), 2)
 PERIOD, COUNT, NOISE = 0.01, 1200, 0.01
 Array = np.ndarray
 

@@ -21,8 +21,9 @@ from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.free_form import (
     EVEN,
     FREE_FORMS,
+    FreeCurve,
     FreeFrictionSpeed,
-    FreeTorque,
+    FreeReadingPosition,
     FreeTorqueLoad,
     FreeTorquePeriodic,
     FreeTorquePosition,
@@ -35,6 +36,7 @@ from sysid_btr.terms.free_form import (
 )
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.sensing import EncoderScale
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.writeback.params import read_params
 from sysid_btr.writeback.write import Identified, params_of
@@ -52,12 +54,12 @@ def moved(term: Term, values: object) -> np.ndarray:
     return np.asarray(replay.predict(np.atleast_2d(np.asarray(values, dtype=float))).position[0, :, 0])
 
 
-def fitted(term: FreeTorque, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def fitted(term: FreeCurve, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Amounts whose curve is nearest to y(x)."""
     return np.asarray(np.linalg.lstsq(term.modes_of("knee", x), y, rcond=None)[0])
 
 
-def at_knee(cls: type[FreeTorque]) -> FreeTorque:
+def at_knee(cls: type[FreeCurve]) -> FreeCurve:
     return cls.at(("knee",), STUDY.scales)
 
 
@@ -84,7 +86,7 @@ def test_periodic_modes_close_and_the_first_two_are_one_wave() -> None:
 
 
 @pytest.mark.parametrize("cls", [FreeTorquePosition, FreeTorqueVelocity, FreeTorqueLoad, FreeTorqueTime])
-def test_a_flat_curve_is_a_constant_torque(cls: type[FreeTorque]) -> None:
+def test_a_flat_curve_is_a_constant_torque(cls: type[FreeCurve]) -> None:
     flat = moved(at_knee(cls), [0.3, *[0.0] * 7])
     np.testing.assert_allclose(flat, moved(ConstantForce.at(("knee",), STUDY.scales), [0.3]), atol=1e-6)
 
@@ -99,6 +101,14 @@ def test_a_straight_curve_of_the_position_is_a_spring_and_beyond_its_range_it_st
     np.testing.assert_allclose(moved(term, amounts), moved(spring, values), atol=1e-3)
     beyond = term.curve("knee", amounts, np.array([high, high + 1.0]))
     assert beyond[0] == beyond[1]
+
+
+def test_a_straight_error_of_the_encoder_is_one_of_its_scale() -> None:
+    term = at_knee(FreeReadingPosition)
+    x = np.linspace(*term.ranges[0], 50)
+    scale = EncoderScale.at(("knee",), STUDY.scales)
+    np.testing.assert_allclose(moved(term, fitted(term, x, 0.05 * x)), moved(scale, [0.05]), atol=1e-3)
+    assert term.axes == ("position (rad)", "error (rad)")
 
 
 def test_level_friction_that_does_not_depend_on_speed_is_dry_friction() -> None:
@@ -133,7 +143,7 @@ def test_the_grammar_frees_a_curve_at_a_joint_over_what_the_joint_does() -> None
 
 
 @pytest.mark.parametrize("cls", FREE_FORMS)
-def test_a_parameter_file_holds_the_range_of_a_curve(cls: type[FreeTorque], tmp_path: Path) -> None:
+def test_a_parameter_file_holds_the_range_of_a_curve(cls: type[FreeCurve], tmp_path: Path) -> None:
     term = at_knee(cls)
     model = Model.of([term], term.neutral + 0.1 * term.parameters[0].scale)
     (tmp_path / "params.json").write_text(json.dumps(params_of(Identified(STUDY, model, (), ()))))

@@ -17,13 +17,15 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.signal_features import FOLDS, line_shares, memory
 from sysid_btr.identify.missing_torque import MissingTorque
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.drives import DriveKind
 from sysid_btr.terms.free_form import (
     FREE_FORMS,
+    FreeCurve,
     FreeFriction,
     FreeFrictionLoad,
     FreeFrictionPosition,
     FreeFrictionSpeed,
-    FreeTorque,
+    FreeReadingPosition,
     FreeTorqueCommand,
     FreeTorqueLoad,
     FreeTorquePeriodic,
@@ -56,11 +58,12 @@ MOST = 4096
 ROUNDS = 8
 """Of the estimate of how large a curve and its noise are."""
 
-VARIABLES: Mapping[type[FreeTorque], Callable[[MissingTorque], FloatArray]] = {
+VARIABLES: Mapping[type[FreeCurve], Callable[[MissingTorque], FloatArray]] = {
     FreeFrictionSpeed: lambda m: m.velocity,
     FreeFrictionLoad: lambda m: m.servo_measured,
     FreeFrictionPosition: lambda m: m.position,
     FreeTorquePosition: lambda m: m.position,
+    FreeReadingPosition: lambda m: m.position,
     FreeTorqueVelocity: lambda m: m.velocity,
     FreeTorqueLoad: lambda m: m.servo,
     FreeTorqueCommand: lambda m: m.command,
@@ -81,7 +84,7 @@ class FreeForm:
     hypothesis : the term at its joint, and where its refit begins.
     share : fraction of the missing torque that it predicts on stretches of time that it was not fitted to.
     x : (n,) values of its variable (of one that is periodic: phases).
-    torque, low, high : (n,) Nm or N, and the 95 % interval at each value; of friction its level.
+    torque, low, high : (n,) Nm or N, of an encoder rad or m, with the 95 % interval at each; of friction its level.
     sentence : the finding in words.
     """
 
@@ -107,9 +110,7 @@ def free_forms(
     """
     loud = [m for m in missing if m.chi2 >= LOUD]
     known = {(type(term), place) for term in problem.terms for place in term.places}
-    driven = frozenset(
-        j for e in problem.episodes for j, d in zip(e.replay.index.joints, e.replay.index.drive, strict=True) if d
-    )
+    drives = {j: d for e in problem.episodes for j, d in zip(e.replay.index.joints, e.replay.index.drive, strict=True)}
     best: list[FreeForm] = []
     others: list[FreeForm] = []
     for joint in dict.fromkeys(m.joint for m in loud):
@@ -117,8 +118,8 @@ def free_forms(
         found = [
             form
             for effect in FREE_FORMS
-            if (effect, joint) not in known and (effect.scope == "joint" or joint in driven)
-            for form in _forms(effect, own, scale_at(scales, joint))
+            if (effect, joint) not in known and _can_be_at(effect, drives.get(joint))
+            for form in _forms(effect, [_evidence(effect, m, problem) for m in own], scale_at(scales, joint))
             if form.share >= WEAK
         ]
         if found:
@@ -129,7 +130,29 @@ def free_forms(
     return tuple(f for part in (best, others) for f in sorted(part, key=lambda f: -f.hypothesis.gain))
 
 
-def _forms(effect: type[FreeTorque], own: Sequence[MissingTorque], scale: JointScale) -> Iterator[FreeForm]:
+def _can_be_at(effect: type[FreeCurve], drive: DriveKind | None) -> bool:
+    """Whether a joint with such a drive, or none, has the variable of a form."""
+    return {"servo": drive == "position", "drive": drive is not None}.get(effect.scope, True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What a form is to explain of one estimate: (n,) torques, or errors of position, and their noise."""
+
+    one: MissingTorque
+    values: FloatArray
+    noise: float
+
+
+def _evidence(effect: type[FreeCurve], one: MissingTorque, problem: ReplayProblem) -> _Evidence:
+    if not issubclass(effect, FreeReadingPosition):
+        return _Evidence(one, one.torque, one.noise)
+    targets = (t for t in problem.episodes[one.episode].targets if one.joint in t.joints)
+    noise = next((float(t.noise[t.joints.index(one.joint)]) for t in targets if t.channel == "position"), 0.0)
+    return _Evidence(one, one.residual * noise, noise)
+
+
+def _forms(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale) -> Iterator[FreeForm]:
     """The form at a joint, if it can be one; of one that is periodic the best frequency."""
     if effect not in OF_TIME:
         yield _form(effect, own, scale, ())
@@ -138,28 +161,27 @@ def _forms(effect: type[FreeTorque], own: Sequence[MissingTorque], scale: JointS
     elif effect is FreeTorqueTime:
         yield _form(effect, own, scale, ())
     else:
-        lines = [_form(effect, own, scale, (f,)) for f in frequencies(own[0])]
+        lines = [_form(effect, own, scale, (f,)) for f in frequencies(own[0].one)]
         yield from sorted(lines, key=lambda f: -f.share)[:1]
 
 
-def _form(
-    effect: type[FreeTorque], own: Sequence[MissingTorque], scale: JointScale, more: tuple[float, ...]
-) -> FreeForm:
-    joint, ends = own[0].joint, effect.range_of(scale)
+def _form(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale, more: tuple[float, ...]) -> FreeForm:
+    joint, ends = own[0].one.joint, effect.range_of(scale)
     kinds = effect.sized(scale)
     count = len(kinds) - len(more)
     relative = np.array([k.upper for k in kinds[:count]]) / kinds[0].upper
     seen, torque = [], []
-    for one in own:
-        rows = slice(None, None, -(-len(one.torque) // MOST))
-        seen.append(one.seen(design(effect, one, ends, *more))[rows])
-        torque.append(one.torque[rows])
+    for each in own:
+        rows = slice(None, None, -(-len(each.values) // MOST))
+        columns = design(effect, each.one, ends, *more)
+        seen.append((columns if issubclass(effect, FreeReadingPosition) else each.one.seen(columns))[rows])
+        torque.append(each.values[rows])
     block = SHORT_STRETCH if effect in OF_TIME else STRETCH
     curve = _penalised(np.concatenate(torque), np.concatenate(seen), relative)
     shares, weights = [], []
-    for one, columns, values in zip(own, seen, torque, strict=True):
-        power = float(np.mean(values**2))
-        real = max(power - one.noise**2, 0.05 * power)
+    for each, columns, values in zip(own, seen, torque, strict=True):
+        one, power = each.one, float(np.mean(values**2))
+        real = max(power - each.noise**2, 0.05 * power, 1e-300)
         samples = block / one.period * len(values) / len(one.torque)
         predicted = _predicted_share(values, columns, curve, max(round(samples), 1))
         shares.append(float(np.clip(predicted * power / real, 0.0, 1.0)))
@@ -173,13 +195,12 @@ def _form(
     hypothesis = Hypothesis(effect, (joint,), False, start, share * float(sum(weights)))
     term = effect.at((joint,), {joint: scale})
     noun, _, rest = effect.title.partition(" that ")
-    article = "a " if noun == "torque" else ""
-    sentence = f"{article}{noun} at {joint} that {rest}: {term.in_words(joint, start)}"
+    sentence = f"{effect.article}{noun} at {joint} that {rest}: {term.in_words(joint, start)}"
     return FreeForm(hypothesis, share, x, line, line - half, line + half, sentence)
 
 
 def design(
-    effect: type[FreeTorque], one: MissingTorque, ends: tuple[float, float], frequency: float = 1.0
+    effect: type[FreeCurve], one: MissingTorque, ends: tuple[float, float], frequency: float = 1.0
 ) -> FloatArray:
     """(n, modes) torques of a form's modes along an estimate, each of rms 1 over its range."""
     x = VARIABLES[effect](one)

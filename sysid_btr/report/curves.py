@@ -11,7 +11,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.report.style import FOUND, faint, new_figure
-from sysid_btr.terms.free_form import FreeTorque
+from sysid_btr.terms.free_form import FreeCurve
 from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def curves_of(model: Model, estimates: Sequence[Estimate]) -> tuple[Curve, ...]:
     std = {e.name: e.std if np.isfinite(e.std) else 0.0 for e in estimates}
     found = []
     for term, own in model.parts:
-        if not isinstance(term, FreeTorque):
+        if not isinstance(term, FreeCurve):
             continue
         errors = np.array([std.get(p.name, 0.0) for p in term.parameters])
         values, spread = (term.spread(np.asarray(x)[None])[0] for x in (own, errors))

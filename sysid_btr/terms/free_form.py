@@ -1,4 +1,4 @@
-"""Torques of a form that is learnt: smooth functions of one thing that a joint does, or of time.
+"""Torques, friction and encoder errors of a form that is learnt: smooth functions of what a joint does, or of time.
 
 Where no law of the library fits, a curve does: cubic B-splines over the range of the variable (de Boor 1978, "A
 Practical Guide to Splines"), whose numbers are the amounts of the modes of their roughness, the integral of the
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Parameter, Step
+from sysid_btr.terms.base import BatchModel, Kind, Outputs, Parameter, Step
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, scale_at
 
@@ -94,8 +94,8 @@ def modal_sum(values: FloatArray, modes: FloatArray) -> FloatArray:
     return np.asarray(total)
 
 
-def _kinds(bounds: Sequence[float], peak: float, size: float) -> tuple[Kind, ...]:
-    return tuple(Kind(f"c{k}", "Nm", 0.0, -w * peak, w * peak, w * size) for k, w in enumerate(bounds, start=1))
+def _kinds(bounds: Sequence[float], peak: float, size: float, unit: str = "Nm") -> tuple[Kind, ...]:
+    return tuple(Kind(f"c{k}", unit, 0.0, -w * peak, w * peak, w * size) for k, w in enumerate(bounds, start=1))
 
 
 def curve_in_words(x: FloatArray, y: FloatArray, across: str, unit: str) -> str:
@@ -118,26 +118,22 @@ def curve_in_words(x: FloatArray, y: FloatArray, across: str, unit: str) -> str:
 
 
 @dataclass(frozen=True)
-class FreeTorque(Effect):
-    """Base: a torque on a joint that is a smooth function of one variable, of no form in particular.
+class FreeCurve(Effect):
+    """Base: something at a joint that is a smooth function of one variable, of no form in particular.
 
     Class attributes
     ----------------
     variable, variable_unit : in a sentence, and on an axis.
+    amount, article : what the curve gives, and how a sentence about it begins.
     """
 
-    name: ClassVar[str] = "free_torque"
-    family: ClassVar[str] = FAMILY
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
     law_acts: ClassVar[tuple[str, ...]] = ()
-    kinds: ClassVar[tuple[Kind, ...]] = _kinds(modal_bounds(SPLINES), 10.0, 0.05)
     variable: ClassVar[str] = ""
     variable_unit: ClassVar[str] = ""
-
-    @classmethod
-    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        return _kinds(modal_bounds(SPLINES), 2 * scale.counter_peak, 0.1 * scale.torque_rms)
+    amount: ClassVar[str] = "torque"
+    article: ClassVar[str] = "a "
 
     @classmethod
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
@@ -161,7 +157,7 @@ class FreeTorque(Effect):
         return (tuple(tuple(k.scale if i == j else 0.0 for j, k in enumerate(kinds)) for i in range(len(kinds))),)
 
     def curve(self, place: str, values: FloatArray, x: FloatArray) -> FloatArray:
-        """(n,) torque at values (n,) of the variable, from the numbers (kinds,) of a place."""
+        """(n,) what is given at values (n,) of the variable, from the numbers (kinds,) of a place."""
         return modal_sum(np.broadcast_to(values, (len(x), len(values))), self.modes_of(place, x))
 
     def modes_of(self, place: str, x: FloatArray) -> FloatArray:
@@ -175,15 +171,15 @@ class FreeTorque(Effect):
     @property
     def axes(self) -> tuple[str, str]:
         """What is across and upwards in a drawing of the curve, with units."""
-        torque, across = self._units
+        unit, across = self._units
         variable = self.variable if across == "1" else f"{self.variable} ({across})"
-        return variable, f"{'torque' if torque == 'Nm' else 'force'} ({torque})"
+        return variable, f"{self.amount} ({unit})"
 
     @property
     def _units(self) -> tuple[str, str]:
-        """Of the torque, and of the variable."""
-        own = self.parameters[0].unit
-        return own, self.variable_unit if own == "Nm" else SLIDE_UNITS.get(self.variable_unit, self.variable_unit)
+        """Of what is given, and of the variable."""
+        own, across = self.parameters[0].unit, self.variable_unit
+        return own, across if own == self.kinds[0].unit else SLIDE_UNITS.get(across, across)
 
     def in_words(self, place: str, values: FloatArray) -> str:
         unit, across = self._units
@@ -198,6 +194,19 @@ class FreeTorque(Effect):
         """(places,) ends of the ranges."""
         table = np.array(self.ranges or [(-1.0, 1.0)] * len(self.places))
         return table[:, 0], table[:, 1]
+
+
+@dataclass(frozen=True)
+class FreeTorque(FreeCurve):
+    """Base: a torque on a joint."""
+
+    name: ClassVar[str] = "free_torque"
+    family: ClassVar[str] = FAMILY
+    kinds: ClassVar[tuple[Kind, ...]] = _kinds(modal_bounds(SPLINES), 10.0, 0.05)
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return _kinds(modal_bounds(SPLINES), 2 * scale.counter_peak, 0.1 * scale.torque_rms)
 
 
 @dataclass(frozen=True)
@@ -438,6 +447,7 @@ class FreeFriction(FreeTorqueOfState):
 
     name: ClassVar[str] = "free_friction"
     family: ClassVar[str] = "friction"
+    article: ClassVar[str] = ""
     law_acts: ClassVar[tuple[str, ...]] = ("friction",)
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
 
@@ -529,15 +539,54 @@ class FreeFrictionPosition(FreeFriction):
         return step.qpos[:, index]
 
 
-FREE_FORMS: tuple[type[FreeTorque], ...] = (
+@dataclass(frozen=True)
+class FreeReadingPosition(FreeCurve):
+    """An error of the logged position that is a smooth function of the position: an eccentric disc, a worn track.
+
+    Sensor: the log shows q and the curve at q; the servo uses the true q.
+    """
+
+    name: ClassVar[str] = "free_reading"
+    family: ClassVar[str] = "sensor"
+    variant: ClassVar[str] = "position"
+    label: ClassVar[str] = "free_reading.position"
+    title: ClassVar[str] = "error of the encoder that depends on the position"
+    variable: ClassVar[str] = "position"
+    variable_unit: ClassVar[str] = "rad"
+    amount: ClassVar[str] = "error"
+    article: ClassVar[str] = "an "
+    kinds: ClassVar[tuple[Kind, ...]] = _kinds(modal_bounds(SPLINES), 0.3, 0.005, "rad")
+    includes: ClassVar[tuple[str, ...]] = ("encoder_offset", "encoder_scale")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("free_torque", "a logged effort, or motion whose stiffness to torque changes"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        reach = 0.3 * scale.span if scale.slide else 0.3
+        return _kinds(modal_bounds(SPLINES), reach, reach / 60, "rad")
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return FreeTorquePosition.range_of(scale)
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        columns = batch.index.of(self.places)
+        modes = self.modes_at(outputs.position[:, :, columns], *self._bounds)
+        outputs.position[:, :, columns] += modal_sum(values[:, None], modes)
+
+
+FREE_FORMS: tuple[type[FreeCurve], ...] = (
     FreeFrictionSpeed,
     FreeFrictionLoad,
     FreeFrictionPosition,
     FreeTorquePosition,
+    FreeReadingPosition,
     FreeTorqueVelocity,
-    FreeTorqueLoad,
-    FreeTorqueCommand,
-    FreeTorqueTime,
     FreeTorquePeriodic,
+    FreeTorqueTime,
+    FreeTorqueCommand,
+    FreeTorqueLoad,
 )
-"""All of them, in the order in which they are preferred where they explain as much."""
+"""All of them, in the order in which they are preferred where they explain as much. The last two may be the answer of a
+controller to something else: a drive, or a host that commands torques."""
