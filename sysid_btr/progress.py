@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self, TextIO
 
 LINE_EVERY = 10.0
-"""Seconds between progress lines where the terminal cannot redraw one."""
+"""Seconds between progress lines where the terminal cannot redraw one; the first one comes at once."""
 
 
 class Interrupted(BaseException):
@@ -53,7 +54,7 @@ class ProgressLine:
     _before: int = 0
     _last: int = 0
     _begun: float = field(default_factory=time.monotonic)
-    _spoken: float = field(default_factory=time.monotonic)
+    _spoken: float = float("-inf")
 
     def __enter__(self) -> Self:
         if self.enabled and self.stream.isatty():
@@ -78,7 +79,7 @@ class ProgressLine:
         if self._bar is not None:
             self._bar.total = None if total is None else self._before + total
             self._bar.n = count
-            self._bar.set_postfix_str(f"loss {best:.4g}{', ' + note if note else ''}")
+            self._bar.set_postfix_str(", ".join((*_loss(best), *((note,) if note else ()))))
         elif self.enabled and time.monotonic() - self._spoken >= LINE_EVERY:
             self._spoken = time.monotonic()
             self._say(count, total, best, note)
@@ -86,7 +87,7 @@ class ProgressLine:
     def _say(self, count: int, total: int | None, best: float, note: str) -> None:
         elapsed = time.monotonic() - self._begun
         rate = count / elapsed if elapsed > 0 else 0.0
-        parts = [f"{self.title}: {count} replays", f"{elapsed:.0f} s", f"loss {best:.4g}"]
+        parts = [f"{self.title}: {count} replays", f"{elapsed:.0f} s", *_loss(best)]
         if total is not None and rate > 0:
             left = max(total - self._last, 0) / rate
             parts.insert(2, f"about {left:.0f} s left")
@@ -94,3 +95,8 @@ class ProgressLine:
             parts.append(note)
         self.stream.write(", ".join(parts) + "\n")
         self.stream.flush()
+
+
+def _loss(best: float) -> tuple[str, ...]:
+    """What is said of the best loss; nothing before there is one."""
+    return (f"loss {best:.4g}",) if math.isfinite(best) else ()

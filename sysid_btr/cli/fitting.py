@@ -91,7 +91,7 @@ class Run:
             raise UsageError("--render writes pictures: give an --out folder for them")
         return run
 
-    def study(self, executor: Executor) -> Study:
+    def study(self, executor: Executor, progress: ProgressLine) -> Study:
         """Logs and model laid out; remarks on the logs go to stderr."""
         from sysid_btr.identify.mode import Mode
         from sysid_btr.identify.study import make_study
@@ -107,6 +107,7 @@ class Run:
             mode=Mode(self.options.mode, self.options.segments),
             threads=self.options.threads,
             executor=executor,
+            progress=progress,
         )
 
     def carry_out(self, job: Job) -> int:
@@ -119,7 +120,7 @@ class Run:
         began = time.perf_counter()
         with ProgressLine(self.verb) as progress, open_executor(self.options.executor) as executor:
             try:
-                outcome = job(self.study(executor), self.keeper.journal, progress)
+                outcome = job(self.study(executor, progress), self.keeper.journal, progress)
             except Interrupted:
                 raise InterruptedRun(self.keeper.interrupted(progress)) from None
             except LostCluster as lost:

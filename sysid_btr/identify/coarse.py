@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget
+from sysid_btr.estimators.base import Budget, Progress, silent
 from sysid_btr.identify.numerics import held_numerics
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten
 from sysid_btr.identify.study import Study
@@ -24,12 +24,12 @@ STIFFER = (0.6, 0.35, 0.25)
 """Contact time constants tried first, as factors of the nominal."""
 
 
-def weigh_columns(study: Study, model: Model, budget: Budget) -> tuple[Study, Fitted]:
+def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress = silent) -> tuple[Study, Fitted]:
     """The study with each column weighed by the error that a first fit from a model leaves in it, and that fit."""
-    study, coarse = first_fit(study, model, budget)
+    study, coarse = first_fit(study, model, budget, progress)
     if float(coarse.train_columns.max()) > MISFIT:
         if not study.procedure.weighs_segments:
-            study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS, budget)
+            study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS, budget, progress)
         study = inflate(study, coarse, memory=True)
     return study, coarse
 
@@ -52,17 +52,17 @@ def realise_servo(study: Study, model: Model) -> Study:
     return replace(study, numerics=held) if misfit[0] < misfit[1] - SERVO_MARGIN else study
 
 
-def first_fit(study: Study, model: Model, budget: Budget) -> tuple[Study, Fitted]:
+def first_fit(study: Study, model: Model, budget: Budget, progress: Progress = silent) -> tuple[Study, Fitted]:
     """First fit: where initial states are uncertain, of them and the parameters in turn, by the coarse integrator."""
     procedure, reference, spent = study.procedure, study.numerics, 0
     if not procedure.alternations:
-        return study, refit(study, model, budget=budget)
+        return study, refit(study, model, budget=budget, progress=progress)
     study = replace(study, numerics=study.coarse)
     model = model.at(best_start(study, model.terms, contact_starts(model)))
     for turn, iterations in enumerate(procedure.alternations, 1):
         if procedure.shares:
             study = study.with_share(procedure.shares[turn - 1], model)
-        found = refit(study, model, iterations=iterations, budget=budget.after(spent))
+        found = refit(study, model, iterations=iterations, budget=budget.after(spent), progress=progress)
         model, spent = found.model, spent + found.evaluations
         last = turn == len(procedure.alternations)
         study = study.with_initial_states(model, held_out=last, anew=last)
@@ -70,7 +70,7 @@ def first_fit(study: Study, model: Model, budget: Budget) -> tuple[Study, Fitted
     if all(episode.procedure.coarse_suffices for episode in study.train):
         return study, judge(study, model, spent)
     # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model
-    right = refit(study, model, budget=budget.after(spent))
+    right = refit(study, model, budget=budget.after(spent), progress=progress)
     return study, replace(right, evaluations=right.evaluations + spent)
 
 

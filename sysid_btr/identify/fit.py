@@ -258,7 +258,7 @@ class _Search:
             goal = problem if self.distance is None else DistanceProblem(problem, self.distance)
             result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
             return _Solved(study, problem, result, result.evaluations + spent, False)
-        study, coarse = weigh_columns(study, model.at(problem.start), budget)
+        study, coarse = weigh_columns(study, model.at(problem.start), budget, progress)
         budget = budget.after(coarse.evaluations)
         problem, spent = study.train_problem(coarse.model), spent + coarse.evaluations
         if study.procedure.deferred:

@@ -208,13 +208,15 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     return replace(study, inflation=worst)
 
 
-def robust_refit(study: Study, fitted: Fitted, rounds: int, budget: Budget | None = None) -> tuple[Study, Fitted]:
+def robust_refit(
+    study: Study, fitted: Fitted, rounds: int, budget: Budget | None = None, progress: Progress = silent
+) -> tuple[Study, Fitted]:
     """Refit with inflated noise until the columns' errors settle; what `fitted` took is of the budget too."""
     budget = budget or Budget()
     for _ in range(rounds):
         before = fitted.train_columns
         study = inflate(study, fitted)
-        again = refit(study, fitted.model, budget=budget.after(fitted.evaluations))
+        again = refit(study, fitted.model, budget=budget.after(fitted.evaluations), progress=progress)
         fitted = replace(again, evaluations=again.evaluations + fitted.evaluations)
         # held-out data must not decide how long is fitted
         if np.all(np.abs(np.log(fitted.train_columns / before)) < 0.02):

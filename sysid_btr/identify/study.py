@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import UsageError
+from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
@@ -188,6 +189,7 @@ def make_study(
     threads: int = 0,
     executor: Executor = HERE,
     nuisance: Mapping[str, float] | None = None,
+    progress: Progress = silent,
 ) -> Study:
     """Lay out an identification.
 
@@ -204,6 +206,7 @@ def make_study(
     executor : where candidates are simulated: this process, or what `open_executor` gives.
     nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, as
         ``{"mass": 0.1}``: intervals then do not take them as exact.
+    progress : is told what is going on.
 
     Raises
     ------
@@ -213,6 +216,8 @@ def make_study(
         If a recording is given twice, the held-out fraction is not between 0 and 1, there is no such simulator, or a
         log does not suit the mode.
     """
+    say = partial(progress, done=0, total=None, best=float("inf"))
+    say(note="reading the motion")
     require_drives(robot, logs)
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
@@ -238,9 +243,11 @@ def make_study(
         nuisance=nuisance or {},
     )
     if numerics is None:
+        say(note="choosing the integrator's step")
         leading = max(train, key=lambda e: e.procedure.demand)
         chosen, error = leading.choose_numerics(threads, given.simulator)
         study = replace(study, numerics=chosen, numerics_error=error)
+    say(note="initial states")
     return study.with_initial_states(Model.of(()))
 
 
