@@ -243,3 +243,20 @@ def test_output_that_nobody_reads_or_that_knows_other_letters(tmp_path: Path) ->
 def test_a_cluster_beyond_this_machine_is_warned_of() -> None:
     assert "pickles" in caution("tcp://robot:8786")
     assert caution("tls://robot:8786") == caution("local:2") == caution(None) == ""
+
+
+@pytest.mark.parametrize("message", [{"name": 3, "position": "x"}, [1, 2], 7, {"name": ["a"], "position": [{}]}, {}])
+def test_messages_whose_fields_are_of_another_type(tmp_path: Path, cli: Cli, message: Any) -> None:
+    writers = pytest.importorskip("mcap.writer")
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = writers.Writer(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/JointState", "jsonschema", b"{}")
+        for topic in ("/joint_states", "/joint_commands"):
+            channel = writer.register_channel(topic, "json", schema)
+            for i in range(60):
+                stamp = 10**15 + i * 10**7
+                writer.add_message(channel, stamp, json.dumps(message).encode(), stamp)
+        writer.finish()
+    assert cli("import", path).code == 3
