@@ -39,9 +39,9 @@ from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderScale
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.writeback.params import read_params
-from sysid_btr.writeback.write import Identified, params_of
+from sysid_btr.writeback.write import Identified, draft, params_of
 
-XML = """<mujoco><worldbody><body><joint name="knee" axis="0 1 0" damping=".1" armature=".01"/>
+XML = """<mujoco model="toy"><worldbody><body name="shank"><joint name="knee" axis="0 1 0" damping=".1" armature=".01"/>
 <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".5"/></body></worldbody>
 <actuator><position joint="knee" kp="20" kv=".5"/></actuator></mujoco>"""
 ROBOT, LOG = robot_from_xml(XML), swing(("knee",), seconds=2.0)
@@ -150,6 +150,16 @@ def test_a_parameter_file_holds_the_range_of_a_curve(cls: type[FreeCurve], tmp_p
     read = read_params(tmp_path / "params.json", ROBOT).model
     assert read.terms[0].ranges == term.ranges
     np.testing.assert_array_equal(read.values, model.values)
+
+
+def test_a_model_file_says_in_words_which_curve_it_does_not_hold() -> None:
+    term = at_knee(FreeTorquePosition)
+    x = np.linspace(*term.ranges[0], 50)
+    amounts = fitted(term, x, 0.2 + 0.0 * x)
+    text = draft(Identified(STUDY, Model.of([term], amounts), (), ())).text().decode()
+    assert (
+        "Not in this file: free_torque (position) of knee: about 0.2 Nm everywhere: a law of every time step." in text
+    )
 
 
 @pytest.mark.parametrize(

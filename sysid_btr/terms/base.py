@@ -363,6 +363,10 @@ class Term:
         """The same over the ranges that what it is a function of has at its places."""
         return self
 
+    def in_words(self, place: str, values: FloatArray) -> str:
+        """What its numbers (kinds,) at a place amount to, where they say nothing one by one; else empty."""
+        return ""
+
     # --- hooks, in the order in which a replay calls them -------------------------------------------------
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:

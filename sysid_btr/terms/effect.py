@@ -91,10 +91,6 @@ class Effect(Term):
             for step in cls.steps
         )
 
-    def in_words(self, place: str, values: FloatArray) -> str:
-        """What its numbers (kinds,) at a place amount to, where they say nothing one by one; else empty."""
-        return ""
-
     def around(self, values: FloatArray) -> Effect:
         """The effect with bounds narrowed to where a search from these values makes sense."""
         return self

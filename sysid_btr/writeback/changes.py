@@ -249,6 +249,8 @@ def amounts(part: Part, place: str) -> str:
     if not term.kinds:
         return ""
     row = part.values[0, term.places.index(place)]
+    if words := term.in_words(place, row):
+        return words
     units = {k.name: p.unit for k, p in zip(term.numbers, term.parameters, strict=False)}
     return ", ".join(
         f"{kind.name} {value:.6g}" + ("" if unit == "1" else f" {unit}")
