@@ -18,6 +18,7 @@ from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.horizon import is_held
 from sysid_btr.identify.mode import Mode
+from sysid_btr.identify.scores import score
 from sysid_btr.identify.segmented import SegmentedEpisode, follow, measured_motion
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log, LogMeta
@@ -26,6 +27,7 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import TorqueScale
 from sysid_btr.terms.servo import CommandDelay
 
@@ -170,6 +172,19 @@ def test_columns_count_in_a_scan_by_what_is_left_in_them_on_its_short_segments()
     found, _ = leading_hypotheses(state, (CoulombFriction, TorqueScale), STANDARD)
     gain = {effect: max(h.gain for h in found if h.effect is effect) for effect in (CoulombFriction, TorqueScale)}
     assert gain[CoulombFriction] > STANDARD.hopeless * gain[TorqueScale]
+
+
+def test_errors_over_the_whole_log_are_told_where_they_stay_bounded() -> None:
+    """Without friction the arms go their own way; with it they can be followed to the end."""
+    log = driven(torque=QUIET, seconds=3.0)
+    study = make_study(double_pendulum(), [log], numerics=Numerics("RK4", 0.005), mode=Mode("segments", "0.5"))
+    terms = study.declare(FREED)
+    assert score(study, Model.of(terms, np.array([1.0, 1.0, 0.0, 0.0]))).whole == {}
+    right = Model.of(terms, np.array(TRUTH))
+    whole = score(study, right).to_dict()["whole"]["position"]
+    replay = FixedEpisode.whole(study.robot, log).compare(terms, ("position",), study.numerics)
+    error = replay.errors(replay.replay.predict(right.values[None]))[0]
+    assert whole["rmse"] == pytest.approx(float(np.sqrt(np.nanmean(error**2))))
 
 
 def test_where_open_loop_holds_segments_give_the_same_answer() -> None:

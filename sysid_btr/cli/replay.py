@@ -94,7 +94,7 @@ def _compare(
     from sysid_btr.identify.mode import Mode
     from sysid_btr.identify.outcome import replay_result
     from sysid_btr.identify.replay import predicted_log, replay_log
-    from sysid_btr.identify.scores import score_problem
+    from sysid_btr.identify.scores import open_loop_scores, score_problem
     from sysid_btr.identify.study import make_study
     from sysid_btr.io.parquet import write_log
     from sysid_btr.objectives.targets import COMPARED
@@ -110,7 +110,7 @@ def _compare(
         mode=Mode(options.mode, options.segments),
         threads=threads,
     )
-    scores = score_problem(study.train_problem(model), model.values)
+    scores, whole = score_problem(study.train_problem(model), model.values), open_loop_scores(study, model)
     for path, one in zip(targets, logs, strict=False):
         own = [episode for episode in study.train if episode.log.path == one.path]
         if all(episode.procedure.replayed for episode in own):
@@ -118,7 +118,7 @@ def _compare(
         else:
             predicted = predicted_log(own, model, study.numerics, threads=threads)
         write_log(predicted, path, overwrite=options.overwrite)
-    result = replay_result(study, scores, dict(options.set), time.perf_counter() - began)
+    result = replay_result(study, scores, dict(options.set), time.perf_counter() - began, whole)
     if options.json:
         print_json(result)
         return

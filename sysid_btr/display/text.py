@@ -18,6 +18,7 @@ PLAIN_WIDTH = 118
 """Columns where the output is no terminal, so that what is piped does not depend on a window."""
 CANDIDATES_SHOWN, EXACT_SHOWN = 6, 4
 PARTS = (("train", "fitted"), ("holdout", "held-out"))
+HELD_OUT = "held out"
 MENTIONED = 0.01
 """Probability from which another cause is mentioned."""
 
@@ -151,15 +152,22 @@ def errors_table(result: Mapping[str, Any]) -> Table:
     for _, name in columns:
         table.add_column(name, justify="right")
     table.add_column("noise floor", justify="right")
-    for part, label in (("train", "fitted data"), ("holdout", "held out")):
-        for channel in result["nominal"].get(part, {}):
-            unit = result["units"].get(channel, "").partition(",")[0]
-            scores = [result[key][part].get(channel, {}) for key, _ in columns]
-            floor = result["noise_floor"].get(channel)
-            *errors, least = si_all([*(s.get("rmse") for s in scores), floor], unit)
-            cells = [text + relative(s.get("nrmse")) for text, s in zip(errors, scores, strict=True)]
-            table.add_row(channel if result["kind"] == "replay" else f"{channel}, {label}", *cells, least)
+    for label, channel, scores in channel_scores(result):
+        unit = result["units"].get(channel, "").partition(",")[0]
+        floor = result["noise_floor"].get(channel)
+        *errors, least = si_all([*(s.get("rmse") for s in scores), floor], unit)
+        cells = [text + relative(s.get("nrmse")) for text, s in zip(errors, scores, strict=True)]
+        alone = result["kind"] == "replay" and label == HELD_OUT
+        table.add_row(channel if alone else f"{channel}, {label}", *cells, least)
     return table
+
+
+def channel_scores(result: Mapping[str, Any]) -> Iterator[tuple[str, str, list[Mapping[str, Any]]]]:
+    """Part of the data, channel, and the score of each model there; an empty one where a model has none."""
+    columns = [result.get(key, {}) for key, _ in stages(result)]
+    for part, label in (("train", "fitted data"), ("holdout", HELD_OUT), ("whole", "whole log")):
+        for channel in dict.fromkeys(c for scores in columns for c in scores.get(part, {})):
+            yield label, channel, [scores.get(part, {}).get(channel, {}) for scores in columns]
 
 
 def relative(nrmse: float | None) -> str:

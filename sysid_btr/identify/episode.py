@@ -288,6 +288,11 @@ class Episode(ABC):
         """Integrator and step to begin with, and the change in noise floors when the step is halved."""
         return choose_numerics(self.robot, self.log, threads, simulator)
 
+    @property
+    def open_loop(self) -> Episode | None:
+        """All of its recording replayed from the first sample, where it is not compared so itself but could be."""
+        return None
+
     def facts(self) -> Mapping[str, Any] | None:
         """What a result says about how it was segmented, and what its base state lacks; None where it is not."""
         return None

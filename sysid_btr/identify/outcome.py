@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from sysid_btr.identify.scores import ChannelScore, channel_entries
+from sysid_btr.identify.scores import ChannelScore, Scores
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
 from sysid_btr.result import SCHEMA, clean, versions
@@ -70,9 +70,16 @@ class StudyOutcome:
 
 
 def replay_result(
-    study: Study, scores: Mapping[str, ChannelScore], parameters: Mapping[str, float], wall_s: float
+    study: Study,
+    scores: Mapping[str, ChannelScore],
+    parameters: Mapping[str, float],
+    wall_s: float,
+    whole: Mapping[str, ChannelScore] | None = None,
 ) -> dict[str, Any]:
-    """Content of a result of kind ``replay``: nothing is fitted, so all data counts as held out."""
+    """Content of a result of kind ``replay``: nothing is fitted, so all data counts as held out.
+
+    `whole` are scores open loop, where `scores` are of segments.
+    """
     channel = study.leading_channel
     leading = scores.get(channel)
     message = "the replay diverged"
@@ -84,7 +91,7 @@ def replay_result(
         "kind": "replay",
         "message": message,
         "noise_floor": {channel: s.floor for channel, s in scores.items()},
-        "nominal": {"train": {}, "holdout": channel_entries(scores)},
+        "nominal": Scores({}, scores, whole or {}).to_dict(),
         "set": dict(parameters),
         "parameters": [],
         "effects": [],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.objectives.targets import COMPARED
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
@@ -39,10 +40,18 @@ class ChannelScore:
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores by channel on fitted (`train`) and held-out data."""
+    """Scores by channel.
+
+    Attributes
+    ----------
+    train, holdout : of fitted and of held-out data, as they are compared with the model.
+    whole : of logs that are compared by segments, replayed open loop from the first sample to the last; empty where
+        that does not stay bounded.
+    """
 
     train: Mapping[str, ChannelScore]
     holdout: Mapping[str, ChannelScore]
+    whole: Mapping[str, ChannelScore] = field(default_factory=dict)
 
     @property
     def floors(self) -> dict[str, float]:
@@ -51,7 +60,8 @@ class Scores:
 
     def to_dict(self) -> dict[str, Any]:
         """By part and channel, as results have them."""
-        return {"train": channel_entries(self.train), "holdout": channel_entries(self.holdout)}
+        whole = {"whole": channel_entries(self.whole)} if self.whole else {}
+        return {"train": channel_entries(self.train), "holdout": channel_entries(self.holdout), **whole}
 
 
 @dataclass(frozen=True)
@@ -96,12 +106,31 @@ def channel_entries(part: Mapping[str, ChannelScore]) -> dict[str, dict[str, Any
 
 def score(study: Study, model: Model) -> Scores:
     """Score a model on every channel that log and model have, fitted or not."""
-    from dataclasses import replace
-
     wide = replace(study, channels=COMPARED)
     fitted, heldout = wide.train_problem(model), wide.holdout_problem(model)
     errors = of_both(fitted, heldout, lambda problem: problem.errors(model.values))
-    return Scores(*(_scores(problem, own) for problem, own in zip((fitted, heldout), errors, strict=True)))
+    return Scores(_scores(fitted, errors[0]), _scores(heldout, errors[1]), open_loop_scores(wide, model))
+
+
+def open_loop_scores(study: Study, model: Model) -> dict[str, ChannelScore]:
+    """Scores of whole recordings that are compared by segments; empty where one does not stay bounded.
+
+    It does where no joint is predicted worse than by its mean.
+    """
+    recordings = {id(e.recording): e for e in (*study.train, *study.holdout)}.values()
+    whole = tuple(open_loop for e in recordings if (open_loop := e.open_loop) is not None)
+    if not whole:
+        return {}
+    problem = replace(study, train=whole).train_problem(model)
+    with silenced():
+        error = problem.errors(model.values)
+    for i, (_, target, k) in enumerate(problem.columns):
+        if target.channel != "position":
+            continue
+        own, measured = error[problem.column_labels == i], target.measured[target.mask[:, k], k]
+        if not np.sqrt(np.mean(own**2)) <= np.std(measured):
+            return {}
+    return _scores(problem, error)
 
 
 def score_problem(problem: ReplayProblem, values: FloatArray) -> dict[str, ChannelScore]:

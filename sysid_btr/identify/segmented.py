@@ -17,7 +17,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError, ModelError
-from sysid_btr.identify.episode import Episode, Procedure
+from sysid_btr.identify.episode import Episode, FixedEpisode, Procedure
 from sysid_btr.identify.horizon import linear_seconds
 from sysid_btr.identify.initial_states import respond, update_initial_states
 from sysid_btr.identify.numerics import choose_numerics, converged, largest_step
@@ -199,6 +199,10 @@ class SegmentedEpisode(Episode):
                 "armature and masses of the model: a body without mass is the usual cause."
             )
         return chosen, error
+
+    @property
+    def open_loop(self) -> Episode | None:
+        return FixedEpisode.whole(self.robot, self.recording)
 
     def facts(self) -> Mapping[str, Any]:
         seconds = segment_seconds(self.segments, self.log)

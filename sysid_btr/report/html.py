@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from sysid_btr.display.changes import model_lines
 from sysid_btr.display.text import (
     certainty_words,
+    channel_scores,
     compact,
     episode_words,
     estimates_of,
@@ -152,14 +153,11 @@ def _data_uri(png: bytes) -> str:
 
 def _error_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     rows = []
-    for part, label in (("train", "fitted data"), ("holdout", "held out")):
-        for channel in result.get("nominal", {}).get(part, {}):
-            unit = result["units"].get(channel, "").partition(",")[0]
-            scores = [result[key][part].get(channel) for key, _ in stages(result)]
-            values = [None if s is None else s["rmse"] for s in scores]
-            *errors, floor = si_all([*values, result["noise_floor"].get(channel)], unit)
-            cells = [None if s is None else {**s, "text": text} for s, text in zip(scores, errors, strict=True)]
-            rows.append({"channel": channel, "part": label, "cells": cells, "floor": floor})
+    for label, channel, scores in channel_scores(result):
+        unit = result["units"].get(channel, "").partition(",")[0]
+        *errors, floor = si_all([*(s.get("rmse") for s in scores), result["noise_floor"].get(channel)], unit)
+        cells = [{**s, "text": text} if s else None for s, text in zip(scores, errors, strict=True)]
+        rows.append({"channel": channel, "part": label, "cells": cells, "floor": floor})
     return rows
 
 
