@@ -187,11 +187,15 @@ def _transfer(data: Path, out: Path, limit: float) -> dict[str, Any]:
 def _with_friction(folder: Path, values: Mapping[str, float], out: Path) -> Path:
     """C1's model with friction of its joints."""
     import mujoco
+    import numpy as np
 
     spec = mujoco.MjSpec.from_file(str(folder / "double_pendulum_C1.xml"))
     for name, value in values.items():
         field, _, joint = name.partition(":")
-        setattr(spec.joint(joint), field, value)
+        # damping is a polynomial of the speed
+        own = np.atleast_1d(getattr(spec.joint(joint), field)).copy()
+        own[0] = value
+        setattr(spec.joint(joint), field, own if len(own) > 1 else value)
     spec.compile()
     place = out / "C1_with_friction_of_A.xml"
     place.parent.mkdir(parents=True, exist_ok=True)
