@@ -163,6 +163,7 @@ def _transfer(data: Path, out: Path, limit: float) -> dict[str, Any]:
     log_a, log_c = folder / "logs" / "A12_055640.parquet", folder / "logs" / "C1_143339.parquet"
     friction = ("--fit", "frictionloss:*", "--fit", "damping:*")
     masses = ("--fit", "mass:*")
+    alike = ("--segments", "1")  # which segments a log is cut into depends on the model's friction
     of_a = run(
         ("fit", "--model", str(folder / "double_pendulum_A.xml"), "--log", str(log_a), *friction, *masses),
         out / "of_a",
@@ -170,10 +171,12 @@ def _transfer(data: Path, out: Path, limit: float) -> dict[str, Any]:
     )
     found = {p["name"]: p["value"] for p in of_a.result.get("parameters", ())}
     model_c = str(folder / "double_pendulum_C1.xml")
-    own = run(("fit", "--model", model_c, "--log", str(log_c), *friction, *masses), out / "own", limit)
+    own = run(("fit", "--model", model_c, "--log", str(log_c), *friction, *masses, *alike), out / "own", limit)
     values = {n: v for n, v in found.items() if not n.startswith("mass")}
     taken = run(
-        ("fit", "--model", str(_with_friction(folder, values, out)), "--log", str(log_c), *masses), out / "taken", limit
+        ("fit", "--model", str(_with_friction(folder, values, out)), "--log", str(log_c), *masses, *alike),
+        out / "taken",
+        limit,
     )
     errors = [_held_out(r, "position") for r in (own, taken)]
     ratio = errors[1] / errors[0] if errors[0] and errors[1] else None
