@@ -14,12 +14,16 @@ import toys
 
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
+from sysid_btr.diagnosis.elimination import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, where_something_is
-from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.search import search
+from sysid_btr.diagnosis.selection import STANDARD, Selection
+from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import attempt
 from sysid_btr.errors import LogError
 from sysid_btr.estimators import Journal
+from sysid_btr.estimators.base import silent
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.refit import judge
 from sysid_btr.identify.replay import replay_log
@@ -35,7 +39,7 @@ from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderOffset, SensorDelay
-from sysid_btr.terms.servo import CommandDelay, IntegralGain
+from sysid_btr.terms.servo import CommandDelay, IntegralGain, Kp
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.terms.transmission import Backlash, JointCompliance
 from sysid_btr.writeback.write import identified
@@ -350,6 +354,22 @@ def test_the_toy_leg_without_a_planted_effect_misses_nothing() -> None:
     found = diagnose(None)
     assert found.verdict == "nothing_missing", found.message
     assert found.effects == ()
+
+
+def test_what_was_chosen_before_the_rest_was_known_is_compared_again() -> None:
+    """A wrong gain of all servos first looks like damping; with friction found beside it, the log tells them apart."""
+    friction = Plant(CoulombFriction(KNEE), (0.15,))
+    study = make_study(toys.leg(), [recorded(friction)], threads=1)
+    state = State.of(fit(study, ["mass:knee"]), None)
+    state = search(state, (ViscousDamping, CoulombFriction), STANDARD, silent)
+    assert {e.name for e in state.effects} == {"viscous_damping", "coulomb_friction"}
+    gain = Hypothesis(Kp, toys.LEG_JOINTS, True, np.array([0.97]), 0.0)
+    state = replace(state, evidence=tuple(replace(e, alternatives=(gain,)) for e in state.evidence))
+    state = exchange(state, STANDARD)
+    assert [e.name for e in state.effects] == ["coulomb_friction", "kp"]
+    assert [(e.family, e.others) for e in state.evidence][1] == (pytest.approx(1.0, abs=1e-3), {})
+    assert state.fitted.model.values[-1] == pytest.approx(TRUE_KP, rel=0.01)
+    assert "viscous_damping" in str(state.steps[-1].removed)
 
 
 # --- where and when it shows -------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.evidence import Evidence
+from sysid_btr.diagnosis.evidence import Evidence, evidence_of, likeliest
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import (
     Selection,
@@ -20,7 +20,7 @@ from sysid_btr.diagnosis.selection import (
     predicts_as_well,
 )
 from sysid_btr.diagnosis.state import State
-from sysid_btr.diagnosis.trials import Trial, attempt
+from sysid_btr.diagnosis.trials import Trial, attempt, is_rival
 from sysid_btr.diagnosis.uncertainty import with_intervals
 from sysid_btr.estimators.base import Progress
 from sysid_btr.identify.refit import inflate, refit, shorten
@@ -35,7 +35,7 @@ def eliminate(state: State, rules: Selection, progress: Progress) -> State:
         state = state.step(removed=removed)
     if not state.effects:
         return state
-    state = _merged(state, rules)
+    state = _merged(exchange(state, rules), rules)
     study = inflate(state.study, state.fitted, memory=True)
     progress(done=rules.rounds, total=None, best=state.fitted.holdout, note="final fit")
     polished = refit(study, state.fitted.model, polish=True, progress=progress)
@@ -107,6 +107,32 @@ def _at_fewer_locations(state: State, effect: Effect, rules: Selection) -> tuple
         return state, ()
     own = state.evidence[state.effects.index(effect)]
     return replace(state, fitted=left.fitted, evidence=(*state.without_evidence_of(effect), own)), dropped
+
+
+def exchange(state: State, rules: Selection) -> State:
+    """The model with each effect compared once more with what else it may be, now that the others are known.
+
+    What was added first was chosen while the others were still missing.
+    """
+    for effect, evidence in zip(state.effects, state.evidence, strict=True):
+        model = state.fitted.model
+        own = Hypothesis(type(effect), effect.places, effect.shared, model.own(effect), 0.0)
+        trials = [Trial(own, state.fitted)]
+        trials += [attempt(state.study, model.without(effect), h, rules) for h in evidence.alternatives]
+        if len(trials) == 1:
+            continue
+        state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
+        winner = likeliest(trials)
+        rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
+        known = evidence_of(winner, trials, rivals)
+        at = state.effects.index(effect)
+        if winner is trials[0]:
+            state = replace(state, evidence=(*state.evidence[:at], known, *state.evidence[at + 1 :]))
+        else:
+            gone = (f"{effect.name} at {', '.join(effect.places)}",)
+            state = replace(state, fitted=winner.fitted, evidence=(*state.without_evidence_of(effect), known))
+            state = state.step(added=(str(winner.hypothesis),), removed=gone)
+    return state
 
 
 def _merged(state: State, rules: Selection) -> State:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.terms.effect import family_of
 
@@ -36,12 +37,14 @@ class Evidence:
     rivals : effects that do nearly as well.
     family, place : weight of all trials with an effect of this family, and of all at a place that this one is at.
     others : weight of each other family that was tried.
+    alternatives : the best hypothesis of each of these, to be tried again once the model is complete.
     """
 
     rivals: tuple[str, ...] = ()
     family: float = 1.0
     place: float = 1.0
     others: Mapping[str, float] = field(default_factory=dict)
+    alternatives: tuple[Hypothesis, ...] = ()
 
     def beside(self, present: Sequence[str]) -> Evidence:
         """The same without rivals that are in the model themselves."""
@@ -52,12 +55,21 @@ class Evidence:
         return replace(self, rivals=tuple(dict.fromkeys((*self.rivals, *other.rivals))))
 
 
+def likeliest(trials: Sequence[Trial]) -> Trial:
+    """The trial of the largest weight; the first one unless another is more likely than it."""
+    finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
+    best = min(finite, key=lambda t: t.fitted.misfit_everywhere)
+    share = weights([t.fitted for t in finite], best.fitted, [t.hypothesis.complexity for t in finite])
+    return finite[int(np.argmax(share))]
+
+
 def evidence_of(winner: Trial, trials: Sequence[Trial], rivals: Sequence[str]) -> Evidence:
     """What the log says of the name of the trial that was added, one of `trials`."""
     finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
     share = weights([t.fitted for t in finite], winner.fitted, [t.hypothesis.complexity for t in finite])
     own, places = family_of(winner.hypothesis.effect), set(winner.hypothesis.places)
     others: dict[str, float] = {}
+    best: dict[str, tuple[float, Hypothesis]] = {}
     family = place = 0.0
     for trial, weight in zip(finite, share, strict=True):
         name = family_of(trial.hypothesis.effect)
@@ -65,8 +77,10 @@ def evidence_of(winner: Trial, trials: Sequence[Trial], rivals: Sequence[str]) -
         place += weight * bool(places & set(trial.hypothesis.places))
         if name != own:
             others[name] = others.get(name, 0.0) + float(weight)
-    told = {name: weight for name, weight in others.items() if weight > LEAST_WEIGHT}
-    return Evidence(tuple(rivals), float(family), float(place), dict(sorted(told.items(), key=lambda x: -x[1])))
+            best[name] = max(best.get(name, (0.0, trial.hypothesis)), (weight, trial.hypothesis), key=lambda x: x[0])
+    told = dict(sorted(((n, w) for n, w in others.items() if w > LEAST_WEIGHT), key=lambda x: -x[1]))
+    alternatives = tuple(best[name][1] for name in told)
+    return Evidence(tuple(rivals), float(family), float(place), told, alternatives)
 
 
 def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -> FloatArray:

@@ -31,9 +31,10 @@ class Kp(Effect):
     """
 
     name: ClassVar[str] = "kp"
+    family: ClassVar[str] = "gain"
     title: ClassVar[str] = "change of the servo's stiffness"
-    usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
+    everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("torque_constant", "a logged effort or current"),
         ("joint_compliance", "a logged effort, or fast motion"),
