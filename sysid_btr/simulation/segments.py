@@ -234,8 +234,7 @@ class SegmentReplay(Replay):
     @cached_property
     def lead(self) -> float:
         """How long before a segment commands may still reach into it, s: as long as any term can delay them."""
-        shaping = (t for t in self.all_terms if type(t).overrides("shape_command"))
-        return max([LEAD, *(p.upper for t in shaping for p in t.parameters if p.unit == "s")])
+        return max([LEAD, *(term.longest_delay for term in self.all_terms)])
 
     @cached_property
     def _segments(self) -> Segments:

@@ -379,6 +379,13 @@ class Term:
     def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
         """Change the starting state in place; qpos and qvel are (m, joints of the log)."""
 
+    @property
+    def longest_delay(self) -> float:
+        """Time (s) after which a command may still act; the longest of its times, if it transforms commands at all."""
+        if not type(self).overrides("shape_command"):
+            return 0.0
+        return max((p.upper for p in self.parameters if p.unit == "s"), default=0.0)
+
     def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         """Transform the commands that reach the servos, (m, steps, joints of the log)."""
         return command

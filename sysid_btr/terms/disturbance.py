@@ -148,6 +148,10 @@ class DriveDisturbanceTrain(ExternalDisturbanceTrain):
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
         return None
 
+    @property
+    def longest_delay(self) -> float:
+        return 0.0  # its times say when pulses come; no command is late
+
     def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
         actuator = batch.index.actuator[batch.index.of(self.places)]
         gains, gears = batch.read("actuator_gainprm"), batch.read("actuator_gear")
