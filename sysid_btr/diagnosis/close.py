@@ -27,6 +27,7 @@ from sysid_btr.io._text import some
 from sysid_btr.io.noise import is_white
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import GROUND, Effect
+from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.library import select_effects
 
 if TYPE_CHECKING:
@@ -73,6 +74,8 @@ def close(
     """
     began = perf_counter()
     asked = select_effects(effects)
+    if "all" in effects:
+        asked = (*asked, *FREE_FORMS)
     require_motion(study)
     while True:
         first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)

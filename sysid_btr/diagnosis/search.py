@@ -12,6 +12,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.elimination import without_dispensable
 from sysid_btr.diagnosis.evidence import evidence_of
+from sysid_btr.diagnosis.free_form import free_forms
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
 from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, explained_by, perturbations, scan
 from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain
@@ -30,12 +31,14 @@ from sysid_btr.diagnosis.trials import (
 from sysid_btr.estimators.base import Progress
 from sysid_btr.estimators.journal import Record
 from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.missing_torque import missing_torques
 from sysid_btr.identify.refit import inflate, judge, refit, robust_refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import body_names, joint_names
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.base import Scope
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
 
 Library = Sequence[type[Effect]]
@@ -78,7 +81,7 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
         if is_superfluous(rules, hypothesis, trials) or is_outdone(rules, hypothesis, trials):
             continue
         if is_hopeless(rules, hypothesis, hypotheses[0], len(trials)):
-            break
+            continue
         trial = attempt(state.study, state.fitted.model, hypothesis, rules)
         trials.append(trial)
         say(f"with {hypothesis} held-out chi2 {trial.fitted.holdout:.4g}")
@@ -121,13 +124,26 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
     if known is not None:
         return from_arrays(known.arrays, library, places), int(known.arrays["answers"])
     began = perf_counter()
-    found, residuals = _scan(state, library, rules)
+    found, residuals = _scan(state, [e for e in library if e not in FREE_FORMS], rules)
     hypotheses = form_hypotheses(found, residuals, rules)
+    hypotheses += _curves(state, library, rules)
     if study.journal is not None:
         arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
         seconds = study.journal.seconds + perf_counter() - began
         study.journal.append(Record("scan", values, arrays, seconds))
     return hypotheses, len(found)
+
+
+def _curves(state: State, library: Library, rules: Selection) -> list[Hypothesis]:
+    """Of which variable what is missing is a smooth function: tried last, where no law says it more simply."""
+    asked = set(library) & set(FREE_FORMS)
+    if not asked:
+        return []
+    study, model = state.study, state.fitted.model
+    problem = study.train_problem(model)
+    forms = free_forms(problem, model.values, study.scales, missing_torques(problem, model.values, study.scales))
+    own = [f.hypothesis for f in forms if f.hypothesis.effect in asked]
+    return [h for h in own if h.gain >= rules.candidate_gain][: rules.curves]
 
 
 def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensitivity], int]:

@@ -50,6 +50,8 @@ class Selection:
     """Effects that are added at most. benchmarks/xl330: a real servo's ladder has up to ten rungs."""
     refits: int = 7
     """Hypotheses that are refitted in a round, at most. Time."""
+    curves: int = 3
+    """How many more may be curves that no law gives. Time."""
     refits_of_one: int = 3
     """How many of these may be of one effect, so that its rivals get their turn: at one location, at several, and
     alike at all of them."""
