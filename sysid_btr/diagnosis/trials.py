@@ -12,6 +12,7 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
+from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
 
 
@@ -94,7 +95,7 @@ def choose(rules: Selection, before: Fitted, trials: Sequence[Trial]) -> Trial |
         if _misfit_everywhere(event) < min(others, default=np.inf) - rules.simpler:
             return event
     if lasting:
-        return _simplest(rules, lasting)
+        return _law_first(rules, before, lasting, _simplest(rules, lasting))
     fitted = [t for t in trials if explains_fitted(rules, before, t.fitted)]
     if not fitted:
         return None
@@ -121,6 +122,21 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
     others = [t for t in near if _is_another(t.hypothesis, simplest.hypothesis)]
     better = [t for t in others if t.fitted.misfit < simplest.fitted.misfit]
     return min([t for t in better if paired_t(t.fitted, simplest.fitted) > rules.t] or [simplest], key=order)
+
+
+def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner: Trial) -> Trial:
+    """Instead of a curve, a law at its place that explains a good part of the same: the curve may follow it."""
+    if winner.hypothesis.effect not in FREE_FORMS:
+        return winner
+    enough = rules.law * (before.holdout - winner.fitted.holdout)
+    laws = [
+        t
+        for t in trials
+        if t.hypothesis.effect not in FREE_FORMS
+        and set(t.hypothesis.places) & set(winner.hypothesis.places)
+        and before.holdout - t.fitted.holdout >= enough
+    ]
+    return _simplest(rules, laws) if laws else winner
 
 
 def _is_another(hypothesis: Hypothesis, simple: Hypothesis) -> bool:
