@@ -34,6 +34,7 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.free_form import FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, ViscousDamping
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
@@ -354,6 +355,26 @@ def test_the_toy_leg_without_a_planted_effect_misses_nothing() -> None:
     found = diagnose(None)
     assert found.verdict == "nothing_missing", found.message
     assert found.effects == ()
+
+
+def test_a_wave_that_no_law_has_is_learnt_as_one() -> None:
+    """Not as a function of the servo's torque, which answers it, nor as pulses."""
+    robot, log = toys.leg(), motion(10.0)
+    study = make_study(robot, [log], numerics=toys.FINE)
+    wave = FreeTorquePeriodic.at(KNEE, study.scales)
+    terms = (*study.declare(("mass:knee", "kp:*=shared")), wave)
+    curve = np.zeros(len(wave.kinds))
+    curve[0], curve[-1] = 0.25, 3.7
+    shown = toys.run(robot, log, terms, [TRUE_MASS, TRUE_KP, *curve], OTHERWISE).position[0]
+    noise = np.random.default_rng(0).normal(0, 5e-4, shown.shape)
+    positions = {f"position.{j}": shown[:, i] + noise[:, i] for i, j in enumerate(toys.LEG_JOINTS)}
+    found = close(make_study(robot, [replace(log, channels={**log.channels, **positions})]), TOY_FIT)
+    effect = only_effect(found)
+    assert (effect.family, effect.where, found.verdict) == ("disturbance", KNEE, "explained"), found.message
+    frequency = next(p for p in effect.parameters if "frequency" in p.name)
+    assert frequency.value == pytest.approx(3.7, abs=0.01)
+    assert "periodic in time" in effect.sentence
+    assert over_floor(found) <= 1.1
 
 
 def test_what_was_chosen_before_the_rest_was_known_is_compared_again() -> None:

@@ -1,8 +1,9 @@
 """From what speaks for a name to the probability that it is right.
 
 A weight among models that were tried says nothing of causes that the library does not have, and a form that is nearly
-right leaves something. So a logistic function of both is fitted to logs whose truth is known and which set nothing else
-(Platt 1999, "Probabilistic outputs for support vector machines"; `python -m benchmarks.blind --calibrate`).
+right leaves something. So the probability is a logistic function of both (Platt 1999, "Probabilistic outputs for
+support vector machines"). Its numbers were set on 18 logs of `benchmarks.blind` (series 7): right names left at most
+1.2 % where they act, imitations 36 to 77 %. A calibration on hundreds of logs that set nothing is still to come.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class NamedEffect:
     variant : realisation under that name, or empty.
     where : joint or body names, or ``robot``.
     parameters : how large, with intervals.
-    certainty : probability that a cause of this family acts there; calibrated, see `sysid_btr.diagnosis.certainty`.
+    certainty : probability that a cause of this family acts there, see `sysid_btr.diagnosis.certainty`.
     otherwise : probabilities of other families, the likeliest first.
     explains : share of the error above the noise floor (squared) that vanishes with it, ``train`` and ``holdout``.
     provisional : whether something is left where it acts, so that its form, or it, may be another.

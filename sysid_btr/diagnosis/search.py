@@ -23,6 +23,7 @@ from sysid_btr.diagnosis.trials import (
     attempt,
     candidates_of,
     choose,
+    has_law,
     is_hopeless,
     is_outdone,
     is_rival,
@@ -81,6 +82,8 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
         if is_superfluous(rules, hypothesis, trials) or is_outdone(rules, hypothesis, trials):
             continue
         if is_hopeless(rules, hypothesis, hypotheses[0], len(trials)):
+            continue
+        if has_law(rules, hypothesis, state.fitted, trials):
             continue
         trial = attempt(state.study, state.fitted.model, hypothesis, rules)
         trials.append(trial)

@@ -73,6 +73,15 @@ def is_outdone(rules: Selection, hypothesis: Hypothesis, trials: Sequence[Trial]
     )
 
 
+def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Sequence[Trial]) -> bool:
+    """Whether a curve is not needed yet: a law at its place explains a good part of what it promises."""
+    return hypothesis.effect in FREE_FORMS and any(
+        float(before.train_cells.sum() - t.fitted.train_cells.sum()) >= rules.law * hypothesis.gain
+        for t in trials
+        if t.hypothesis.effect not in FREE_FORMS and set(t.hypothesis.places) & set(hypothesis.places)
+    )
+
+
 def is_hopeless(rules: Selection, hypothesis: Hypothesis, best: Hypothesis, tried: int) -> bool:
     """Whether a hypothesis promises much less than the most promising one, when some were tried."""
     return tried >= rules.least_refits and hypothesis.gain < rules.hopeless * best.gain
