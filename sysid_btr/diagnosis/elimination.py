@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.evidence import Evidence, evidence_of, likeliest
+from sysid_btr.diagnosis.evidence import Evidence, evidence_of
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import (
     Selection,
@@ -122,7 +122,7 @@ def exchange(state: State, rules: Selection) -> State:
         if len(trials) == 1:
             continue
         state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
-        winner = likeliest(trials)
+        winner = clearly_better(rules, trials)
         rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
         known = evidence_of(winner, trials, rivals)
         at = state.effects.index(effect)
@@ -133,6 +133,12 @@ def exchange(state: State, rules: Selection) -> State:
             state = replace(state, fitted=winner.fitted, evidence=(*state.without_evidence_of(effect), known))
             state = state.step(added=(str(winner.hypothesis),), removed=gone)
     return state
+
+
+def clearly_better(rules: Selection, trials: Sequence[Trial]) -> Trial:
+    """The first of several trials, unless another predicts held-out data better by what simplicity is worth."""
+    best = min(trials, key=lambda t: t.fitted.misfit if np.isfinite(t.fitted.holdout) else np.inf)
+    return best if best.fitted.misfit < trials[0].fitted.misfit - rules.simpler else trials[0]
 
 
 def _merged(state: State, rules: Selection) -> State:

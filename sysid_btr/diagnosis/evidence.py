@@ -55,14 +55,6 @@ class Evidence:
         return replace(self, rivals=tuple(dict.fromkeys((*self.rivals, *other.rivals))))
 
 
-def likeliest(trials: Sequence[Trial]) -> Trial:
-    """The trial of the largest weight; the first one unless another is more likely than it."""
-    finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
-    best = min(finite, key=lambda t: t.fitted.misfit_everywhere)
-    share = weights([t.fitted for t in finite], best.fitted, [t.hypothesis.complexity for t in finite])
-    return finite[int(np.argmax(share))]
-
-
 def evidence_of(winner: Trial, trials: Sequence[Trial], rivals: Sequence[str]) -> Evidence:
     """What the log says of the name of the trial that was added, one of `trials`."""
     finite = [t for t in trials if np.isfinite(t.fitted.holdout)]

@@ -24,6 +24,10 @@ from sysid_btr.terms.scales import Scales
 
 SLOW = 0.05
 """Of the rms velocity: below it the direction of motion is no matter of a sign."""
+SHARE = 0.5
+"""Rms of each unknown torque, of what is left over at its joint: about as much a fit has taken up. With it 116 of 120
+intervals of a leg hold the truth, and estimates scatter by 0.95 standard errors; without a discrepancy 83 hold it (15
+effects that nobody declared, four seeds)."""
 MOST_JOINTS = 12
 """Joints that leave most, at which a discrepancy is assumed; each costs eight columns."""
 
@@ -70,7 +74,7 @@ def discrepancy(problem: ReplayProblem, values: FloatArray, scales: Scales) -> D
     parts = []
     for number, episode in enumerate(problem.episodes):
         own = {one.joint: one for one in left if one.episode == number}
-        seen = _responses(episode, values, scales, own, {j: size[j] / unit[j] for j in joints})
+        seen = _responses(episode, values, scales, own, {j: SHARE * size[j] / unit[j] for j in joints})
         parts.append(np.zeros((_count(episode), len(joints) * FEATURES)) if seen is None else seen)
     return Discrepancy(np.concatenate(parts))
 
@@ -98,6 +102,8 @@ def features(one: MissingTorque) -> FloatArray:
 
 
 FEATURES = 8
+NORMAL = 1.96
+"""Standard errors that half a 95 % interval has."""
 
 
 def _size(ones: Sequence[MissingTorque]) -> float:
@@ -170,8 +176,6 @@ def widened(
     tuple of Estimate
         As they are where nothing can be said: over segments, on a free base.
     """
-    from scipy.stats import t as student
-
     doubt = discrepancy(problem, values, scales)
     if doubt is None:
         return tuple(found)
@@ -179,12 +183,12 @@ def widened(
     white = doubt.whiten(np.column_stack([jacobian, residual]))
     steep, rest = white[:, :-1], white[:, -1]
     shift = newton(steep, rest)
-    cov, dof = spread(steep, rest + steep @ shift, blocks)
+    cov, _ = spread(steep, rest + steep @ shift, blocks)
     std = np.sqrt(np.diag(cov))
     result = []
     for i, (one, parameter) in enumerate(zip(found, parameters, strict=True)):
         own = max(one.std, float(np.hypot(shift[i], std[i])))
-        half = float(student.ppf(0.975, dof[i])) * own
+        half = NORMAL * own
         low, high = max(one.value - half, parameter.lower), min(one.value + half, parameter.upper)
         span = parameter.upper - parameter.lower
         result.append(
