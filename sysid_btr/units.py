@@ -47,3 +47,10 @@ def with_digits_of(value: float | None, std: float | None) -> str:
         return f"{value:.4g}"
     decimals = 1 - math.floor(math.log10(std))
     return f"{value:.{decimals}f}" if 0 <= decimals <= 7 else f"{value:.4g}"
+
+
+def probability(value: float) -> str:
+    """A probability in percent, which is never 0 or 100."""
+    if value > 0.995:
+        return "over 99 %"
+    return "under 1 %" if value < 0.005 else f"{100 * value:.0f} %"

@@ -316,8 +316,9 @@ def test_close_names_the_effect_and_resumes(cli: Cli, bench: Path, tmp_path: Pat
     out = tmp_path / "o"
     asked = ("--model", bench / "arm.xml", "--log", bench / "sticky.parquet", "--fit", "kp:*", "--threads", 1)
     asked = (*asked, "--effects", "coulomb_friction,viscous_damping", "--effects", "command_delay")
-    answer = cli("close", *asked, "--out", out)
+    answer = cli("close", *asked, "--out", out, "--explain")
     assert answer.code == 0, answer.err
+    assert "leaves more than coulomb_friction at hinge" in answer.out.replace("\n", " ")
     result = read_result(out)
     assert result["verdict"] == "explained"
     [effect] = result["effects"]

@@ -494,7 +494,12 @@ def test_candidates_are_listed_best_first_with_those_that_did_as_well() -> None:
         return trial(effect, fitted([chi2], model=model))
 
     trials = [weighed(SIMPLE, 5.4, 0.3), weighed(OTHER, 5.0, 0.2), weighed(CommandDelay, 5.9, 0.1)]
-    found = candidates_of(RULES, fitted([11.0]), trials)
+    found = candidates_of(RULES, fitted([11.0]), trials, trials[1], 2)
+    assert [(c.round, c.amounts, c.why) for c in found] == [
+        (2, {"knee": 0.2}, "added"),
+        (2, {"knee": 0.3}, "leaves more than viscous_damping at knee"),
+        (2, {"knee": 0.1}, "leaves more than viscous_damping at knee"),
+    ]
     assert [(c.effect, c.amplitude) for c in found] == [
         ("viscous_damping", 0.2),
         ("coulomb_friction", 0.3),
@@ -506,7 +511,8 @@ def test_candidates_are_listed_best_first_with_those_that_did_as_well() -> None:
         ("viscous_damping", "command_delay"),
         ("coulomb_friction",),
     ]
-    worse = candidates_of(RULES, fitted([4.0]), trials)
+    worse = candidates_of(RULES, fitted([4.0]), trials, None, 1)
+    assert {c.why for c in worse} == {"data that were not fitted do not want it"}
     assert all(c.confused_with == () for c in worse), "what makes it worse is confused with nothing"
 
 

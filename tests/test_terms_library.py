@@ -55,7 +55,8 @@ def test_every_promised_effect_is_there() -> None:
 def test_effects_are_chosen_by_name_and_a_wrong_name_is_told() -> None:
     usual = {e.name for e in select_effects(["all"])}
     assert set(NAMES.split()) <= usual
-    assert usual.isdisjoint({"mass", "inertia", "kp", "kv", "torque_constant"}), "what the user declares"
+    assert usual.isdisjoint({"mass", "inertia", "kv", "torque_constant"}), "what the user declares"
+    assert "kp" in usual, "a servo that is weaker than the model says"
     assert [e.name for e in select_effects(["kp", "frictionloss", "delay"])] == [
         "kp", "coulomb_friction", "command_delay"
     ]  # fmt: skip

@@ -29,6 +29,7 @@ class CloseOptions(NuisanceOptions, FittingOptions):
     """Options of `close`."""
 
     effects: Names = option(("all",), "Effects that may be named.", metavar="all|NAME[,NAME..]", decides=True)
+    explain: bool = option(False, "Print all that was tried, and what became of it.", decides=False)
 
 
 def close(options: CloseOptions) -> int:
@@ -59,7 +60,7 @@ def close(options: CloseOptions) -> int:
             progress=progress,
         )
 
-    return Run.open("close", options, robot).carry_out(job)
+    return Run.open("close", options, robot).carry_out(job, explain=options.explain)
 
 
 def declared(robot: Robot, fit: Sequence[str]) -> tuple[str, ...]:

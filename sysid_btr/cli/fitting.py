@@ -110,8 +110,8 @@ class Run:
             progress=progress,
         )
 
-    def carry_out(self, job: Job) -> int:
-        """Do the work, write and print what it found; the exit code."""
+    def carry_out(self, job: Job, *, explain: bool = False) -> int:
+        """Do the work, write and print what it found, with all that was tried or the best of it; the exit code."""
         from sysid_btr.executors import caution, open_executor
         from sysid_btr.result import exit_code
 
@@ -127,7 +127,7 @@ class Run:
                 raise InterruptedRun(f"{lost}\n{self.keeper.interrupted(progress)}") from None
         result = outcome.to_dict(seed=self.options.seed, wall_s=time.perf_counter() - began)
         self._write(outcome, result)
-        print_result(result, self.options.json)
+        print_result(result, self.options.json, explain=explain)
         return exit_code(result)
 
     def _write(self, outcome: Fit | Closing | Posterior, result: dict[str, Any]) -> None:

@@ -47,11 +47,11 @@ def print_json(content: Any) -> None:
     sys.stdout.write(text)
 
 
-def print_result(result: dict[str, Any], as_json: bool) -> None:
+def print_result(result: dict[str, Any], as_json: bool, *, explain: bool = False) -> None:
     """A result for people, or for programs."""
     if as_json:
         print_json(result)
         return
     from sysid_btr.display.text import console, show
 
-    show(result, console(sys.stdout))
+    show(result, console(sys.stdout), explain=explain)

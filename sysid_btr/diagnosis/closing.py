@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from sysid_btr._typing import FloatArray
@@ -68,6 +68,9 @@ class Candidate:
     explained : fraction of the excess residual on the held-out part.
     amplitude : value of its main parameter.
     confused_with : other candidates whose trace in this log is nearly the same.
+    round : of the search, from 1.
+    amounts : value of its main parameter at each place.
+    why : what became of it, and why.
     """
 
     effect: str
@@ -75,6 +78,9 @@ class Candidate:
     explained: float
     amplitude: float
     confused_with: tuple[str, ...]
+    round: int = 0
+    amounts: Mapping[str, float] = field(default_factory=dict)
+    why: str = ""
 
 
 @dataclass(frozen=True)

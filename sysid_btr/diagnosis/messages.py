@@ -11,7 +11,7 @@ from sysid_btr.diagnosis.closing import NamedEffect, Verdict
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import Scores
 from sysid_btr.terms.effect import Effect
-from sysid_btr.units import si_all
+from sysid_btr.units import probability, si_all
 
 
 def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
@@ -91,12 +91,12 @@ def _partly(effects: Sequence[NamedEffect], rest: str, left: Mapping[str, Any] |
     """What is likely, what else was added, and what is left."""
     likely = [e for e in effects if e.likely]
     text = "Partly explained: the model lacks " + "; ".join(
-        f"{e.sentence} ({100 * e.certainty:.0f} % certain of the {e.family}{', its form open' * e.provisional})"
+        f"{e.sentence} ({probability(e.certainty)} certain of the {e.family}{', its form open' * e.provisional})"
         for e in likely
     )
     others = [e for e in effects if not e.likely]
     if others:
-        added = "; ".join(f"{e.sentence} ({100 * e.certainty:.0f} %)" for e in others)
+        added = "; ".join(f"{e.sentence} ({probability(e.certainty)})" for e in others)
         text += f". Also added, less likely than not to be what it is called: {added}"
     text += f". {rest[0].upper()}{rest[1:]} (squared, above the noise) is left"
     return text + (f": {left.get('summary', 'not characterised')}." if left else ".")

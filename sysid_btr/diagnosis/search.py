@@ -66,6 +66,8 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             )
         ]
         winner = choose(rules, now, worthy)
+        told = candidates_of(rules, now, trials, winner, number)
+        state = replace(state, candidates=(*state.candidates, *told))
         if winner is None:
             break
         state = _add(state, winner, trials, rules)
@@ -89,8 +91,6 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
         trials.append(trial)
         say(f"with {hypothesis} held-out chi2 {trial.fitted.holdout:.4g}")
         state = state.spent(trial.fitted.evaluations)
-    if not state.candidates or state.effects:
-        state = replace(state, candidates=(*state.candidates, *candidates_of(rules, state.fitted, trials)))
     return state, trials
 
 

@@ -163,8 +163,10 @@ def is_rival(rules: Selection, winner: Trial, other: Trial) -> bool:
     return paired_t(winner.fitted, other.fitted) < rules.t
 
 
-def candidates_of(rules: Selection, before: Fitted, trials: Sequence[Trial]) -> list[Candidate]:
-    """What was weighed, best first, with the fraction of the held-out excess that it removes."""
+def candidates_of(
+    rules: Selection, before: Fitted, trials: Sequence[Trial], winner: Trial | None, number: int
+) -> list[Candidate]:
+    """What was weighed in a round, best first, with the fraction of the held-out excess that it removes."""
     ordered = sorted(trials, key=lambda t: t.fitted.misfit)
     excess = max(before.holdout - 1.0, 1e-9)
     result = []
@@ -178,6 +180,46 @@ def candidates_of(rules: Selection, before: Fitted, trials: Sequence[Trial]) -> 
             and gain > 0
             and abs(other.fitted.misfit - fitted.misfit) < rules.rival
         )
-        amplitude = float(fitted.model.own(fitted.model.terms[-1])[effect.main])
-        result.append(Candidate(effect.name, trial.hypothesis.places, gain, amplitude, tuple(dict.fromkeys(alike))))
+        term = fitted.model.terms[-1]
+        amounts = term.spread(fitted.model.own(term)[None])[0][:, effect.main]
+        result.append(
+            Candidate(
+                effect=effect.name,
+                where=trial.hypothesis.places,
+                explained=gain,
+                amplitude=float(amounts[0]),
+                confused_with=tuple(dict.fromkeys(alike)),
+                round=number,
+                amounts=dict(zip(trial.hypothesis.places, map(float, amounts), strict=True)),
+                why=fate(rules, before, trial, winner),
+            )
+        )
     return result
+
+
+def fate(rules: Selection, before: Fitted, trial: Trial, winner: Trial | None) -> str:
+    """What became of a trial in its round, and why, in words."""
+    if trial is winner:
+        return "added"
+    if not np.isfinite(trial.fitted.holdout):
+        return "its replay diverges"
+    if not is_wanted(rules, before, trial):
+        return "data that were not fitted do not want it"
+    if winner is None:
+        return "removes too little of what was there at first"
+    best = winner.hypothesis
+    if trial.fitted.misfit > winner.fitted.misfit + rules.simpler:
+        return f"leaves more than {best}"
+    if trial.hypothesis.complexity > best.complexity:
+        return f"predicts no better than {best}, which is simpler"
+    return f"does as well as {best}, and gives way to it"
+
+
+def is_wanted(rules: Selection, before: Fitted, trial: Trial) -> bool:
+    """Whether any of the ways to be added is open to a trial."""
+    fitted, once = trial.fitted, trial.hypothesis.effect.transient
+    return (
+        improves(rules, before, fitted)
+        or explains_fitted(rules, before, fitted)
+        or (once and improves_once(rules, before, fitted))
+    )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 from sysid_btr.display.changes import model_lines
 from sysid_btr.display.printable import printable
-from sysid_btr.units import si_all, with_digits_of
+from sysid_btr.units import probability, si_all, with_digits_of
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -56,13 +56,13 @@ def console(stream: TextIO) -> Console:
     return Screen(file=stream, width=width, highlight=False, emoji=False, markup=False)
 
 
-def show(result: Mapping[str, Any], out: Console) -> None:
-    """Print the result of a fit, a closing or a replay."""
-    for part in _parts(result):
+def show(result: Mapping[str, Any], out: Console, *, explain: bool = False) -> None:
+    """Print the result of a fit, a closing or a replay; `explain` adds all effects that were tried, and their fate."""
+    for part in _parts(result, explain):
         out.print(part)
 
 
-def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
+def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]:
     from rich.text import Text
 
     verdict = result.get("verdict")
@@ -82,7 +82,9 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
             if p["reason"]:
                 yield Text(f"  {p['name']}: {identifiability(p)}: {p['reason']}")
     yield from (Text(line) for line in model_lines(result))
-    if result.get("verdict") in ("ambiguous", "partly_explained", "unexplained") and result.get("candidates"):
+    if explain and result.get("candidates"):
+        yield tried_table(result["candidates"])
+    elif result.get("verdict") in ("ambiguous", "partly_explained", "unexplained") and result.get("candidates"):
         yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
     if result.get("signature"):
         yield Text("residual: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
@@ -105,8 +107,8 @@ def _parts(result: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 def certainty_words(effect: Mapping[str, Any]) -> str:
     """How sure a name is, what else it would be, and what it explains."""
-    text = f"{100 * effect['certainty']:.0f} % certain of the {effect['family']}"
-    others = [f"{name} {100 * p:.0f} %" for name, p in effect["otherwise"].items() if p >= MENTIONED]
+    text = f"{probability(effect['certainty'])} certain of the {effect['family']}"
+    others = [f"{name} {probability(p)}" for name, p in effect["otherwise"].items() if p >= MENTIONED]
     if others:
         text += f" (else {', '.join(others)})"
     gone = [f"{100 * effect['explains'][part]:.3g} % of the {name}" for part, name in PARTS]
@@ -233,6 +235,18 @@ def candidates_table(candidates: Sequence[Mapping[str, Any]]) -> Table:
         explained = "-" if c["explained"] is None else f"{100 * c['explained']:.0f} %"
         where = ", ".join(c["where"])
         table.add_row(c["effect"], where, explained, number(c["amplitude"]), ", ".join(c["confused_with"]))
+    return table
+
+
+def tried_table(candidates: Sequence[Mapping[str, Any]]) -> Table:
+    """Effects that were tried, round by round, the best first, and what became of each."""
+    table = _table("effect tried")
+    for name in ("round", "would explain", "amounts", "what became of it"):
+        table.add_column(name)
+    for c in sorted(candidates, key=lambda c: (c["round"], -(c["explained"] or 0.0))):
+        explained = "-" if c["explained"] is None else f"{100 * c['explained']:.3g} %"
+        amounts = ", ".join(f"{place} {number(value, 3)}" for place, value in c["amounts"].items())
+        table.add_row(c["effect"], str(c["round"]), explained, amounts, c["why"])
     return table
 
 
