@@ -184,7 +184,7 @@ def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:
             5,
             9,
             ("joint_spring", "encoder_offset", "encoder_scale", "com_offset", "payload", "constant_force"),
-            {"spring"},  # a cable is one, between two joints
+            {"spring", "disturbance"},  # a cable is a spring between two joints, and pulls
         ),
         ("gait", "controller_dropout:HipPitch:start=1.8,duration=0.07,every=2.1", 5, 12, ("all",), set()),
         ("poses", "controller_dropout:AnkleRoll:start=1.8,duration=0.12,every=2", 6, 12, ("all",), set()),
