@@ -205,7 +205,7 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
         # noise is white; an error of the model is not, and says as little as its independent samples
         error = chi2 * length if memory and chi2 > CORRELATED else chi2
         worst[key] = max(worst.get(key, 1.0), float(np.sqrt(error)) if np.isfinite(error) else 1.0)
-    return replace(study, inflation=worst)
+    return replace(study, inflation=worst, independent=memory)
 
 
 def robust_refit(

@@ -51,6 +51,7 @@ class Study:
         column that the model cannot explain yet from distorting parameters about which others are informative. What is
         wrong about the ground is not an error of a robot that hangs.
     numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
+    independent : whether `inflation` lets each column count as its independent samples do.
     nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, for the intervals.
     executor : where candidates are simulated.
     journal : record of refits, from which an interrupted search goes on; None keeps none.
@@ -67,6 +68,7 @@ class Study:
     executor: Executor = HERE
     journal: Journal | None = None
     nuisance: Mapping[str, float] = field(default_factory=dict)
+    independent: bool = False
 
     @property
     def leading_channel(self) -> str:
@@ -105,7 +107,8 @@ class Study:
         return self._problem(self.holdout, as_model(model))
 
     def _problem(self, episodes: Iterable[Episode], model: Model) -> ReplayProblem:
-        return ReplayProblem(tuple(self._compare(e, model.terms) for e in episodes), model.values, self.executor)
+        compared = tuple(self._compare(e, model.terms) for e in episodes)
+        return ReplayProblem(compared, model.values, self.executor, deviation=float(self.independent))
 
     def _compare(self, episode: Episode, terms: Terms) -> Comparison:
         return episode.compare(terms, self.channels, self.numerics, inflation=self.inflation, threads=self.threads)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -96,14 +96,14 @@ class ReplayProblem:
     episodes : replays under the same parameters.
     start : (p,) where a search begins.
     executor : where candidates are simulated.
-    deviation : decrease of the loss that one standard deviation is worth at least: residuals are in units of their
-        noise, and less than one where columns are correlated and count less for it.
+    deviation : decrease of the loss that one standard deviation is worth at least: one where residuals count as their
+        independent samples do, and zero where that is not known.
     """
 
     episodes: tuple[Comparison, ...]
     start: FloatArray
     executor: Executor = HERE
-    deviation: ClassVar[float] = 1.0
+    deviation: float = 0.0
 
     def __getstate__(self) -> dict[str, Any]:
         """What another process needs; it simulates there."""
@@ -294,7 +294,7 @@ class ReplayProblem:
     def with_model(self, model: Model) -> ReplayProblem:
         """The same data under another set of terms, and a search that begins at other values."""
         episodes = tuple(replace(e, replay=replace(e.replay, terms=model.terms)) for e in self.episodes)
-        return ReplayProblem(episodes, model.values, self.executor)
+        return replace(self, episodes=episodes, start=model.values)
 
     def with_numerics(self, numerics: Numerics) -> ReplayProblem:
         """The same problem under another integrator or step."""

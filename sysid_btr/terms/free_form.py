@@ -229,6 +229,7 @@ class FreeTorquePosition(FreeTorqueOfState):
     Law: the curve at the position at the middle of each step.
     """
 
+    family: ClassVar[str] = "spring"
     variant: ClassVar[str] = "position"
     label: ClassVar[str] = "free_torque.position"
     title: ClassVar[str] = "torque that depends on the position"
@@ -255,6 +256,7 @@ class FreeTorqueVelocity(FreeTorqueOfState):
     Law: the curve at the velocity at the middle of each step; slow ones are told apart more finely.
     """
 
+    family: ClassVar[str] = "friction"
     variant: ClassVar[str] = "velocity"
     label: ClassVar[str] = "free_torque.velocity"
     title: ClassVar[str] = "torque that depends on the velocity"
