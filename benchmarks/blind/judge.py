@@ -105,7 +105,7 @@ def judge(
     robot_joints : all joints of the robot.
     context : what the log holds.
     """
-    names = named_effects(result["effects"])
+    names = named_effects(e for e in result["effects"] if e.get("certainty", 1.0) > 0.5)
     inside = all(e.in_library for e in effects)
     if not effects or not inside:
         outcome, why = _nothing_to_name(result["verdict"], names, expected="" if not effects else effects[0].name)

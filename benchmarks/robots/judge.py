@@ -44,7 +44,7 @@ def judge(result: Mapping[str, Any], planted: Sequence[Planted], alike: frozense
     planted : what there is.
     alike : joints that are coupled, so that what is at one may as well be at any of them.
     """
-    named = [Name.of(entry) for entry in result["effects"]]
+    named = [Name.of(entry) for entry in result["effects"] if is_likely(entry)]
     used: set[int] = set()
     errors, missing = [], []
     for one in planted:
@@ -68,6 +68,11 @@ def judge(result: Mapping[str, Any], planted: Sequence[Planted], alike: frozense
     if error > AMOUNT:
         return Judgement("not right", f"amount {100 * error:.0f} % off", error)
     return Judgement("right", "", error)
+
+
+def is_likely(entry: Mapping[str, Any]) -> bool:
+    """Whether a result holds an effect's name for more likely than not; it stands in the model in either case."""
+    return bool(entry.get("certainty", 1.0) > 0.5)
 
 
 @dataclass(frozen=True)
