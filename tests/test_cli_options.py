@@ -32,6 +32,7 @@ WITH_A_JOURNAL = ("fit", "posterior", "close", "btr", "excite")
 DECIDES_NOTHING = {
     "executor",
     "exchange",
+    "explain",
     "iterations",
     "json",
     "max_evaluations",
