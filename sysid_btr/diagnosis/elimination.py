@@ -20,7 +20,7 @@ from sysid_btr.diagnosis.selection import (
     predicts_as_well,
 )
 from sysid_btr.diagnosis.state import State
-from sysid_btr.diagnosis.trials import Trial, attempt, is_rival
+from sysid_btr.diagnosis.trials import Trial, attempt
 from sysid_btr.diagnosis.uncertainty import with_intervals
 from sysid_btr.estimators.base import Progress
 from sysid_btr.identify.refit import inflate, refit, shorten
@@ -123,8 +123,7 @@ def exchange(state: State, rules: Selection) -> State:
             continue
         state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
         winner = clearly_better(rules, trials)
-        rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
-        known = evidence_of(winner, trials, rivals)
+        known = evidence_of(rules, winner, trials)
         at = state.effects.index(effect)
         if winner is trials[0]:
             state = replace(state, evidence=(*state.evidence[:at], known, *state.evidence[at + 1 :]))

@@ -10,22 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.trials import Trial, is_rival
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.terms.effect import family_of
-
-if TYPE_CHECKING:
-    from sysid_btr.diagnosis.trials import Trial
 
 DRAWS = 400
 """Bayesian bootstrap draws over stretches: a weight is known to 0.025 at worst."""
 LEAST_WEIGHT = 1e-3
-"""Weight of another name below which it is not mentioned; and how near to 0 and 1 a weight is believed."""
+"""Weight of another family below which it is not mentioned."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class Evidence:
         return replace(self, rivals=tuple(dict.fromkeys((*self.rivals, *other.rivals))))
 
 
-def evidence_of(winner: Trial, trials: Sequence[Trial], rivals: Sequence[str]) -> Evidence:
+def evidence_of(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Evidence:
     """What the log says of the name of the trial that was added, one of `trials`."""
     finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
     share = weights([t.fitted for t in finite], winner.fitted, [t.hypothesis.complexity for t in finite])
@@ -72,7 +70,8 @@ def evidence_of(winner: Trial, trials: Sequence[Trial], rivals: Sequence[str]) -
             best[name] = max(best.get(name, (0.0, trial.hypothesis)), (weight, trial.hypothesis), key=lambda x: x[0])
     told = dict(sorted(((n, w) for n, w in others.items() if w > LEAST_WEIGHT), key=lambda x: -x[1]))
     alternatives = tuple(best[name][1] for name in told)
-    return Evidence(tuple(rivals), float(family), float(place), told, alternatives)
+    rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
+    return Evidence(rivals, float(family), float(place), told, alternatives)
 
 
 def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -> FloatArray:

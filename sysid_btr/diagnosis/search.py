@@ -26,7 +26,6 @@ from sysid_btr.diagnosis.trials import (
     has_law,
     is_hopeless,
     is_outdone,
-    is_rival,
     is_superfluous,
 )
 from sysid_btr.estimators.base import Progress
@@ -101,8 +100,7 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
         study = replace(study, numerics=winner.fitted.numerics)
     kept, spent = without_dispensable(study, winner, rules)
     hypothesis, fitted = kept.hypothesis, kept.fitted
-    rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
-    evidence = evidence_of(winner, trials, rivals)
+    evidence = evidence_of(rules, winner, trials)
     # a more general effect takes the place of the special case it includes
     gone = [
         e

@@ -77,9 +77,14 @@ def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Se
     """Whether a curve is not needed yet: a law at its place explains a good part of what it promises."""
     return hypothesis.effect in FREE_FORMS and any(
         float(before.train_cells.sum() - t.fitted.train_cells.sum()) >= rules.law * hypothesis.gain
-        for t in trials
-        if t.hypothesis.effect not in FREE_FORMS and set(t.hypothesis.places) & set(hypothesis.places)
+        for t in _laws_beside(hypothesis, trials)
     )
+
+
+def _laws_beside(curve: Hypothesis, trials: Sequence[Trial]) -> list[Trial]:
+    """Of several trials those of laws, at a place of a curve."""
+    places = set(curve.places)
+    return [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
 
 
 def is_hopeless(rules: Selection, hypothesis: Hypothesis, best: Hypothesis, tried: int) -> bool:
@@ -138,13 +143,7 @@ def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner
     if winner.hypothesis.effect not in FREE_FORMS:
         return winner
     enough = rules.law * (before.holdout - winner.fitted.holdout)
-    laws = [
-        t
-        for t in trials
-        if t.hypothesis.effect not in FREE_FORMS
-        and set(t.hypothesis.places) & set(winner.hypothesis.places)
-        and before.holdout - t.fitted.holdout >= enough
-    ]
+    laws = [t for t in _laws_beside(winner.hypothesis, trials) if before.holdout - t.fitted.holdout >= enough]
     return _simplest(rules, laws) if laws else winner
 
 
