@@ -43,8 +43,6 @@ NEARLY = 0.07
 """A form that comes earlier is preferred if its share is within this of the best one's, likewise."""
 STRETCH, SHORT_STRETCH = 2.5, 0.5
 """Seconds that are predicted from the others, for a function of a state, and of time, likewise."""
-SLOW = 0.05
-"""Velocity, relative to its rms, below which its sign is a matter of noise."""
 CYCLES = 3.0
 """Periods that a log must hold for a torque to be periodic."""
 LINES = 3
@@ -207,8 +205,7 @@ def design(
     modes = effect.modes_at(x * frequency if effect is FreeTorquePeriodic else x, *ends)
     if not issubclass(effect, FreeFriction):
         return modes
-    size = float(np.sqrt(np.mean(one.velocity**2)))
-    return np.asarray(-np.tanh(one.velocity / max(SLOW * size, 1e-300))[:, None] * modes)
+    return np.asarray(-one.direction[:, None] * modes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,12 +109,6 @@ def _within_train(problem: ReplayProblem, values: FloatArray, joint: str, start:
     return False
 
 
-def _direction(one: MissingTorque) -> FloatArray:
-    """Sign of velocity, smooth where a measured sign would be a matter of noise."""
-    size = float(np.sqrt(np.mean(one.velocity**2)))
-    return np.asarray(np.tanh(one.velocity / max(0.05 * size, 1e-300)))
-
-
 def _unit(x: FloatArray) -> FloatArray:
     """Centred, with a largest value of one."""
     centred = x - x.mean()
@@ -125,7 +119,7 @@ def _of_motion(one: MissingTorque, degree: int = 3) -> FloatArray:
     """What friction, inertia, springs and gravity explain, to be set aside before searching; (n, 3 + degree)."""
     q = _unit(one.position)
     powers = [q**k for k in range(1, degree + 1)]
-    columns = (_direction(one), one.velocity, one.acceleration, *powers)
+    columns = (one.direction, one.velocity, one.acceleration, *powers)
     return one.seen(np.column_stack([_unit(c) for c in columns]))
 
 
@@ -346,7 +340,7 @@ def _features(
     one: MissingTorque, torques: Sequence[MissingTorque], periodic: dict[str, Any] | None
 ) -> Iterator[_Feature]:
     """What is tried, from simple to complicated."""
-    sign, load, q = _direction(one), one.servo, one.position
+    sign, load, q = one.direction, one.servo, one.position
 
     def of(x: FloatArray, count: int) -> FloatArray:
         return hats(x, signal_features.even_knots(x, count))

@@ -32,6 +32,8 @@ PULSES = 5
 """Pulses whose responses are averaged, at least."""
 EDGE = 0.1
 """Seconds before the end of an episode whose torque shows too late to be known."""
+SLOW = 0.05
+"""Signal, relative to its rms, below which its sign is a matter of noise."""
 ITERATIONS = 4
 """Of the estimate of how large the torques are."""
 
@@ -75,6 +77,11 @@ class MissingTorque:
     frequency: FloatArray
     gain: FloatArray
 
+    @property
+    def direction(self) -> FloatArray:
+        """(n,) sign of the velocity, smooth where a measured sign would be a matter of noise."""
+        return smooth_sign(self.velocity)
+
     def seen(self, columns: FloatArray) -> FloatArray:
         """Torques (n, k) or (n,) as this estimate would show them, without noise."""
         mirrored = np.concatenate([columns, columns[::-1]])
@@ -85,7 +92,20 @@ class MissingTorque:
         return np.asarray(np.fft.irfft(spectrum, len(mirrored), axis=0)[: len(columns)])
 
 
-def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) -> tuple[MissingTorque, ...]:
+def smooth_sign(signal: FloatArray) -> FloatArray:
+    """Sign of a signal (n,), smooth where it is small beside its rms."""
+    size = float(np.sqrt(np.mean(signal**2)))
+    return np.asarray(np.tanh(signal / max(SLOW * size, 1e-300)))
+
+
+def torque_responses(problem: ReplayProblem, values: FloatArray, scales: Scales) -> tuple[TorqueResponse | None, ...]:
+    """What each episode shows of torques at its joints; see `TorqueResponse.of`."""
+    return tuple(TorqueResponse.of(episode, values, scales) for episode in problem.episodes)
+
+
+def missing_torques(
+    problem: ReplayProblem, values: FloatArray, scales: Scales, responses: Sequence[TorqueResponse | None] | None = None
+) -> tuple[MissingTorque, ...]:
     """Torques that a problem's model lacks, at every measured joint of every episode.
 
     Where torques are compared they are what is left; elsewhere position errors are deconvolved into them.
@@ -95,6 +115,7 @@ def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) 
     problem : data and terms.
     values : (p,) of the terms.
     scales : sizes at the joints.
+    responses : of each episode, where they are known already.
 
     Returns
     -------
@@ -102,11 +123,12 @@ def missing_torques(problem: ReplayProblem, values: FloatArray, scales: Scales) 
         Empty where the replay diverges.
     """
     result: list[MissingTorque] = []
-    for i, episode in enumerate(problem.episodes):
+    known = torque_responses(problem, values, scales) if responses is None else responses
+    for i, (episode, response) in enumerate(zip(problem.episodes, known, strict=True)):
         if isinstance(episode.replay, InverseReplay):
             result += _compared(i, episode, episode.replay, values, scales)
-            continue
-        result += _deconvolve(i, episode, values, scales)
+        elif response is not None:
+            result += _deconvolve(i, episode, response, scales)
     return tuple(result)
 
 
@@ -270,10 +292,7 @@ class TorqueResponse:
         return self.shown[channel][subtree], np.asarray(np.fft.irfft(spectrum, size, axis=0)[: len(torques)])
 
 
-def _deconvolve(number: int, episode: Comparison, values: FloatArray, scales: Scales) -> list[MissingTorque]:
-    found = TorqueResponse.of(episode, values, scales)
-    if found is None:
-        return []
+def _deconvolve(number: int, episode: Comparison, found: TorqueResponse, scales: Scales) -> list[MissingTorque]:
     target = next(t for t in episode.targets if t.channel == "position")
     clock, error, states, joints = found.clock, found.error, found.states, found.joints
     torque = np.empty_like(error)
