@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -77,48 +78,80 @@ class HiddenRobot:
 
     def run(self, controller: Controller) -> Trial:
         """Try a controller in the hidden simulation."""
-        world = self.world
-        commands = world.spread(self.space.joints, self.space.commands(controller.values[None], self.task.time))
+        world, joints = self.world, self.space.joints
+        commands = world.spread(joints, self.space.commands(controller.values[None], self.task.time))
         (_, outputs), *_ = world.run(commands, self.truth[None])
         assert outputs.base is not None
         if not np.isfinite(outputs.base).all():
             return Trial(None, 0.0, "crashed")
-        rng = np.random.default_rng([self.seed, *np.ascontiguousarray(controller.values).view(np.uint32)])
-        down = self.task.fallen(outputs.base)[0]
+        used = [world.index.joints.index(j) for j in joints]
         sensors = world.sensors(outputs, commands[0], self.truth)
-        log = self._log(outputs.base[0], outputs.position[0], commands[0], sensors, rng)
-        fitness = float(self.task.fitness(outputs.base)[0]) + self.noise.fitness * rng.normal()
-        if down.any():
-            # what lies on the ground is hardly informative: the recording stops there
-            return Trial(log.window(0, max(int(np.argmax(down)), 2)), fitness, "fallen")
-        return Trial(log, fitness, "done")
+        moved = Motion(outputs.base[0], outputs.position[0][:, used], commands[0][:, used], sensors)
+        return recorded(moved, self.task, joints, self.noise, noise_of(self.seed, controller), world.robot.name)
 
-    def _log(
-        self,
-        base: FloatArray,
-        position: FloatArray,
-        command: FloatArray,
-        sensors: dict[str, FloatArray],
-        rng: np.random.Generator,
-    ) -> Log:
-        world, noise, n = self.world, self.noise, len(position)
-        joints = world.index.joints
-        seen = position + noise.encoder * rng.normal(size=position.shape)
-        if noise.step > 0:
-            seen = np.round(seen / noise.step) * noise.step
-        used = [joints.index(j) for j in self.space.joints]
-        channels = {f"command.{joints[i]}": command[:, i] for i in used}
-        channels |= {f"position.{joints[i]}": seen[:, i] for i in used}
-        for name, sigma in (("gyro", noise.gyro), ("acc", noise.acc)):
-            if name in sensors:
-                values = sensors[name] + sigma * rng.normal(size=(n, 3))
-                channels |= {f"imu.{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
-        roll, pitch = _tilt(base[:, 3:7])
-        channels["imu.angle_x"] = roll + noise.angle * rng.normal(size=n)
-        channels["imu.angle_y"] = pitch + noise.angle * rng.normal(size=n)
-        channels |= {f"force.{k.removeprefix('force_')}": v[:, 0] for k, v in sensors.items() if k.startswith("force_")}
-        meta = LogMeta(robot=world.robot.name, mount="free", sample_period=self.task.period, source="hidden simulation")
-        return Log(self.task.time, channels, meta, np.zeros(n, dtype=np.int64))
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What a simulated robot did in a trial, at the task's samples.
+
+    Attributes
+    ----------
+    base : (n, 13) as in `Outputs.base`.
+    position, command : (n, j) of the joints that are commanded.
+    sensors : the model's by name, (n, size) each.
+    """
+
+    base: FloatArray
+    position: FloatArray
+    command: FloatArray
+    sensors: Mapping[str, FloatArray]
+
+
+def noise_of(seed: int, controller: Controller) -> np.random.Generator:
+    """Random numbers of a controller's trial: the same whenever it is tried."""
+    return np.random.default_rng([seed, *np.ascontiguousarray(controller.values).view(np.uint32)])
+
+
+def recorded(
+    motion: Motion, task: Walk, joints: Sequence[str], noise: Noise, rng: np.random.Generator, robot: str
+) -> Trial:
+    """The trial as its noisy sensors tell it; after a fall nothing is recorded.
+
+    Parameters
+    ----------
+    motion : what happened.
+    task : which.
+    joints : that are commanded, (j,).
+    noise, rng : of the sensors.
+    robot : its name, for the log.
+    """
+    base = motion.base[None]
+    down = task.fallen(base)[0]
+    log = _log(motion, task, joints, noise, rng, robot)
+    fitness = float(task.fitness(base)[0]) + noise.fitness * rng.normal()
+    if down.any():
+        # what lies on the ground is hardly informative: the recording stops there
+        return Trial(log.window(0, max(int(np.argmax(down)), 2)), fitness, "fallen")
+    return Trial(log, fitness, "done")
+
+
+def _log(motion: Motion, task: Walk, joints: Sequence[str], noise: Noise, rng: np.random.Generator, robot: str) -> Log:
+    n, sensors = len(motion.base), motion.sensors
+    seen = motion.position + noise.encoder * rng.normal(size=motion.position.shape)
+    if noise.step > 0:
+        seen = np.round(seen / noise.step) * noise.step
+    channels = {f"command.{joint}": motion.command[:, i] for i, joint in enumerate(joints)}
+    channels |= {f"position.{joint}": seen[:, i] for i, joint in enumerate(joints)}
+    for name, sigma in (("gyro", noise.gyro), ("acc", noise.acc)):
+        if name in sensors:
+            values = sensors[name] + sigma * rng.normal(size=(n, 3))
+            channels |= {f"imu.{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
+    roll, pitch = _tilt(motion.base[:, 3:7])
+    channels["imu.angle_x"] = roll + noise.angle * rng.normal(size=n)
+    channels["imu.angle_y"] = pitch + noise.angle * rng.normal(size=n)
+    channels |= {f"force.{k.removeprefix('force_')}": v[:, 0] for k, v in sensors.items() if k.startswith("force_")}
+    meta = LogMeta(robot=robot, mount="free", sample_period=task.period, source="hidden simulation")
+    return Log(task.time, channels, meta, np.zeros(n, dtype=np.int64))
 
 
 def _tilt(q: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,49 @@
+"""What is known of a model, and the models that are drawn from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid_btr.btr.belief import Belief
+from sysid_btr.terms.base import Parameter
+
+
+def parameter(name: str, lower: float, upper: float) -> Parameter:
+    return Parameter(name, "1", 1.0, lower, upper, 0.1)
+
+
+def belief(bounds: float, covariance: list[list[float]], mean: float = 1.0) -> Belief:
+    names = [chr(97 + i) for i in range(len(covariance))]
+    parameters = tuple(parameter(name, 1 - bounds, 1 + bounds) for name in names)
+    return Belief(parameters, np.full(len(covariance), mean), np.array(covariance))
+
+
+def test_draws_have_the_mean_and_covariance_that_are_believed() -> None:
+    covariance = [[0.04, 0.03], [0.03, 0.09]]
+    drawn = belief(50.0, covariance).draws(np.random.default_rng(0), 4096)
+    np.testing.assert_allclose(drawn.mean(axis=0), 1.0, atol=0.02)
+    np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.005)
+
+
+@pytest.mark.parametrize("mean", [1.0, 1.4, 9.0])
+def test_draws_stay_within_the_bounds(mean: float) -> None:
+    drawn = belief(0.3, [[1.0, 0.9], [0.9, 1.0]], mean).draws(np.random.default_rng(1), 64)
+    assert np.all((drawn >= 0.7) & (drawn <= 1.3))
+
+
+def test_what_is_known_exactly_does_not_vary() -> None:
+    drawn = belief(0.5, [[0.01, 0.0], [0.0, 0.0]]).draws(np.random.default_rng(2), 32)
+    np.testing.assert_allclose(drawn[:, 1], 1.0, atol=1e-9)
+    assert np.std(drawn[:, 0]) > 0.05
+
+
+def test_beliefs_beside_each_other_are_independent() -> None:
+    both = belief(0.5, [[0.04]]).beside(belief(0.5, [[0.09]], 1.2))
+    np.testing.assert_array_equal(both.mean, [1.0, 1.2])
+    np.testing.assert_array_equal(both.covariance, [[0.04, 0.0], [0.0, 0.09]])
+
+
+def test_numbers_that_do_not_belong_to_the_parameters_are_refused() -> None:
+    with pytest.raises(ValueError, match="1 parameters"):
+        Belief((parameter("a", 0.0, 2.0),), np.ones(2), np.eye(2))
