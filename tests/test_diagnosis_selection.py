@@ -187,6 +187,13 @@ def test_has_minimum_gain(first: Numbers, before: Numbers, after: Numbers, trans
     assert gains is expected
 
 
+@pytest.mark.parametrize(("left", "expected"), [(97.6, False), (97.4, True)])
+def test_a_curve_beside_named_effects_removes_more_than_the_right_form_may_leave(left: float, expected: bool) -> None:
+    first, after = fitted([101.0]), fitted([1 + left])
+    assert has_minimum_gain(RULES, first, first, after)
+    assert has_minimum_gain(RULES, first, first, after, learnt=True) is expected
+
+
 def test_a_longer_ladder_of_effects_is_no_shorter_for_what_happens_at_some_moment() -> None:
     first, after = fitted([101.0]), fitted([95.0])
     assert not has_minimum_gain(Selection(minimum_gain=0.1), first, first, after, transient=True)

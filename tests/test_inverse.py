@@ -23,6 +23,7 @@ from sysid_btr.models.robot import Robot, robot_from_file
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.coupling import DriveCoupling
+from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.scales import JointScale
 
@@ -221,9 +222,11 @@ def test_what_no_single_sample_shows_is_refused_and_not_looked_for(arm: Robot) -
     for name in ("backlash", "joint_compliance"):
         with pytest.raises(UsageError, match=rf"{name}: .* --mode forward"):
             study.declare([f"{name}:elbow"])
-    sought = {effect.name for effect in usable_effects(select_effects(("all",)), study)}
-    assert "coulomb_friction" in sought
+    sought = {effect.label or effect.name for effect in usable_effects((*select_effects(("all",)), *FREE_FORMS), study)}
+    assert sought >= {"coulomb_friction", "free_friction.load"}
     assert not sought & {"backlash", "joint_compliance"}
+    # a torque that depends on the very torque that is to be explained explains anything
+    assert not sought & {"free_torque.load", "free_torque.command"}
 
 
 def test_a_log_without_commands_is_fitted_from_the_shell(

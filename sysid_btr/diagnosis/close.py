@@ -26,7 +26,7 @@ from sysid_btr.identify.study import Study
 from sysid_btr.io._text import some
 from sysid_btr.io.noise import is_white
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.effect import GROUND, Effect
+from sysid_btr.terms.effect import COMMANDS, GROUND, Effect
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.library import select_effects
 
@@ -114,9 +114,10 @@ def require_motion(study: Study) -> None:
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
     """Effects that these logs could show at all, given mount and channels."""
     floating = any(episode.procedure.leaves_ground_error for episode in study.train)
+    replayed = any(episode.procedure.replayed for episode in study.train)
     result = []
     for effect in filter(study.shows, effects):
-        if effect.needs == GROUND and not floating:
+        if (effect.needs == GROUND and not floating) or (effect.needs == COMMANDS and not replayed):
             continue
         if effect.needs == "effort" and not any(episode.logged(("effort",)) for episode in study.train):
             continue

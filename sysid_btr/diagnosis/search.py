@@ -56,14 +56,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             progress(done=number, total=None, best=best, note=f"round {number}: {note}")
 
         state, trials = _try_promising(state, library, rules, say)
-        worthy = [
-            t
-            for t in trials
-            # what others leave unexplained at some moment looks like a push
-            if has_minimum_gain(
-                rules, state.before, now, t.fitted, transient=t.hypothesis.effect.transient and bool(state.effects)
-            )
-        ]
+        worthy = [t for t in trials if _is_worthy(rules, state, t)]
         winner = choose(rules, now, worthy)
         told = candidates_of(rules, now, trials, winner, number)
         state = replace(state, candidates=(*state.candidates, *told))
@@ -71,6 +64,22 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             break
         state = _add(state, winner, trials, rules)
     return state
+
+
+def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
+    """Whether a trial removes more than a trace; beside others, more than what these leave looks like.
+
+    At one moment that is a push, and of any variable some curve.
+    """
+    effect, beside = trial.hypothesis.effect, bool(state.effects)
+    return has_minimum_gain(
+        rules,
+        state.before,
+        state.fitted,
+        trial.fitted,
+        transient=effect.transient and beside,
+        learnt=effect in FREE_FORMS and beside,
+    )
 
 
 def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:

@@ -121,7 +121,7 @@ class Selection:
     for prediction, whose last rungs mean less. Judgement."""
     minimum_gain_transient: float = 0.05
     """The same for what happens at some moment, once other effects are named: what these leave at one moment looks
-    like a push. Judgement."""
+    like a push. Judgement. A curve that is learnt must then remove more than the right form may leave (`explained`)."""
     least_excess: float = 0.002
     """Excess that a column is taken to have at first, at least: it is divided by."""
 
@@ -222,15 +222,16 @@ def something_left(rules: Selection, first: Fitted, now: Fitted) -> bool:
 
 
 def has_minimum_gain(
-    rules: Selection, first: Fitted, before: Fitted, after: Fitted, *, transient: bool = False
+    rules: Selection, first: Fitted, before: Fitted, after: Fitted, *, transient: bool = False, learnt: bool = False
 ) -> bool:
     """Whether an effect removes more than a trace of what some column had above its floor at first.
 
-    `transient` says that it happens at some moment, beside others that are named.
+    `transient` says that it happens at some moment, `learnt` that its form is learnt; both beside others that are
+    named.
     """
     if len(first.columns) != len(before.columns):
         return True
-    least = max(rules.minimum_gain, rules.minimum_gain_transient) if transient else rules.minimum_gain
+    least = max(rules.minimum_gain, rules.minimum_gain_transient * transient, (1 - rules.explained) * learnt)
     excess = np.maximum(first.columns - 1, rules.least_excess)
     return bool(np.nanmax((before.columns - after.columns) / excess) >= least)
 

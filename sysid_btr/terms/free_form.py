@@ -18,7 +18,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import BatchModel, Kind, Outputs, Parameter, Step
-from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.effect import COMMANDS, Effect, Probe
 from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, scale_at
 
 if TYPE_CHECKING:
@@ -290,6 +290,7 @@ class FreeTorqueLoad(FreeTorqueOfState):
     """
 
     scope: ClassVar = "drive"
+    needs: ClassVar[str] = COMMANDS
     variant: ClassVar[str] = "load"
     label: ClassVar[str] = "free_torque.load"
     title: ClassVar[str] = "torque that depends on load"
@@ -318,6 +319,7 @@ class FreeTorqueCommand(FreeTorqueOfState):
     """
 
     scope: ClassVar = "servo"
+    needs: ClassVar[str] = COMMANDS
     variant: ClassVar[str] = "command"
     label: ClassVar[str] = "free_torque.command"
     title: ClassVar[str] = "torque that depends on the command"
