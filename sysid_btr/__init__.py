@@ -21,14 +21,18 @@ if TYPE_CHECKING:
     from sysid_btr.identify.replay import replay_log
     from sysid_btr.identify.study import make_study
     from sysid_btr.importing import import_log
+    from sysid_btr.io.log import Log, LogMeta
     from sysid_btr.io.parquet import read_log, write_log
-    from sysid_btr.io.validation import validate_file, validate_log
+    from sysid_btr.io.validation import validate_file
     from sysid_btr.models.builtin import load_robot
+    from sysid_btr.models.log_checks import validate_log
     from sysid_btr.posterior import posterior
     from sysid_btr.result import read_result
-    from sysid_btr.saving import save
+    from sysid_btr.saving import save, tables
 
 _HOME = {
+    "Log": "sysid_btr.io.log",
+    "LogMeta": "sysid_btr.io.log",
     "close": "sysid_btr.diagnosis.close",
     "fit": "sysid_btr.identify.fit",
     "import_log": "sysid_btr.importing",
@@ -40,12 +44,15 @@ _HOME = {
     "read_result": "sysid_btr.result",
     "replay_log": "sysid_btr.identify.replay",
     "save": "sysid_btr.saving",
+    "tables": "sysid_btr.saving",
     "validate_file": "sysid_btr.io.validation",
-    "validate_log": "sysid_btr.io.validation",
+    "validate_log": "sysid_btr.models.log_checks",
     "write_log": "sysid_btr.io.parquet",
 }
 
 __all__ = [
+    "Log",
+    "LogMeta",
     "close",
     "fit",
     "import_log",
@@ -57,6 +64,7 @@ __all__ = [
     "read_result",
     "replay_log",
     "save",
+    "tables",
     "validate_file",
     "validate_log",
     "write_log",

@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from sysid_btr.io.importers.base import Importer
     from sysid_btr.io.importers.run import Imported, KnownModel
     from sysid_btr.models.robot import Robot
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def import_log(
-    source: PathLike | Sequence[PathLike],
+    source: PathLike | Sequence[PathLike] | pd.DataFrame,
     *,
     model: str | Robot | None = None,
     mapping: PathLike | None = None,
@@ -32,7 +35,8 @@ def import_log(
 
     Parameters
     ----------
-    source : a file, a folder of a bag or dataset, or several of them, which become episodes of one log.
+    source : a file, a folder of a bag or dataset, or several of them, which become episodes of one log; or a
+        DataFrame, whose index may be the clock.
     model : built-in name, file, or robot: its joints are matched by name, and their ranges checked.
     mapping : mapping file (TOML); `sysid_btr.io.importers.mapping` describes it.
     units : channel or column -> unit, as ``--unit``; wins over the mapping.
@@ -62,8 +66,28 @@ def import_log(
         renames=list((rename or {}).items()),
         meta={"mount": mount},
     )
-    paths = [source] if isinstance(source, str | os.PathLike) else list(source)
-    return read(paths, importer=importer, told=told, model=known_model(model))
+    known = known_model(model)
+    if isinstance(source, str | os.PathLike):
+        return read([source], importer=importer, told=told, model=known)
+    if isinstance(source, Sequence):
+        return read(list(source), importer=importer, told=told, model=known)
+    with TemporaryDirectory() as folder:
+        return read([_as_file(source, Path(folder))], importer=importer, told=told, model=known)
+
+
+def _as_file(table: pd.DataFrame, folder: Path) -> Path:
+    """A table as a file, which importers read."""
+    from sysid_btr.errors import LogError
+    from sysid_btr.io.frames import with_time
+
+    path = folder / "DataFrame"
+    try:
+        with_time(table).to_parquet(path, index=False)
+    except (TypeError, ValueError) as error:  # pyarrow's errors derive from the latter
+        raise LogError(
+            f"the DataFrame cannot be read as a table: {error}; give every column one name and type"
+        ) from error
+    return path
 
 
 def known_model(wanted: str | Robot | None) -> KnownModel | None:

@@ -5,14 +5,23 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar, Token
 from dataclasses import dataclass, field
+from functools import wraps
 from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, ParamSpec, Self, TextIO, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 LINE_EVERY = 10.0
 """Seconds between progress lines where the terminal cannot redraw one; the first one comes at once."""
+
+
+_SHOWN = ContextVar("_SHOWN", default=False)
+"""Whether a line is being shown: what runs within that run shows none of its own."""
 
 
 class Interrupted(BaseException):
@@ -51,13 +60,15 @@ class ProgressLine:
     enabled: bool = True
     best: float = float("inf")
     _bar: Any = None
+    _before_it: Token[bool] | None = None
     _before: int = 0
     _last: int = 0
     _begun: float = field(default_factory=time.monotonic)
     _spoken: float = float("-inf")
 
     def __enter__(self) -> Self:
-        if self.enabled and self.stream.isatty():
+        self._before_it = _SHOWN.set(True)
+        if self.enabled and (self.stream.isatty() or in_notebook()):
             from tqdm import tqdm
 
             self._bar = tqdm(desc=self.title, unit=" replays", file=self.stream, leave=False, smoothing=0.1)
@@ -68,6 +79,8 @@ class ProgressLine:
     ) -> None:
         if self._bar is not None:
             self._bar.close()
+        if self._before_it is not None:
+            _SHOWN.reset(self._before_it)
 
     def __call__(self, *, done: int, total: int | None, best: float, note: str) -> None:
         """Report; the contract of `sysid_btr.estimators.base.Progress`."""
@@ -95,6 +108,39 @@ class ProgressLine:
             parts.append(note)
         self.stream.write(", ".join(parts) + "\n")
         self.stream.flush()
+
+
+def watched(*, done: int, total: int | None, best: float, note: str) -> None:
+    """Progress where nothing is said: a line on stderr if that is a terminal or a notebook, else nothing."""
+
+
+def shows_progress(title: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Make a function, called without `progress`, show a line where somebody watches and none is shown yet."""
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+            told = kwargs.get("progress", watched) is not watched
+            if told or _SHOWN.get() or not (_is_terminal(sys.stderr) or in_notebook()):
+                return function(*args, **kwargs)
+            with ProgressLine(title) as line:
+                kwargs["progress"] = line
+                return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def in_notebook() -> bool:
+    """Whether this is a kernel of Jupyter."""
+    module = sys.modules.get("IPython")
+    shell = None if module is None else module.get_ipython()
+    return shell is not None and hasattr(shell, "kernel")
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    return stream is not None and stream.isatty()
 
 
 def _loss(best: float) -> tuple[str, ...]:

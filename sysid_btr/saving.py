@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.run_folder import DRAWS, Folder, open_folder
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.excite.design import Design
     from sysid_btr.identify.fit import Fit
@@ -35,6 +38,33 @@ def save(
     """
     folder = open_folder(Path(out), overwrite=overwrite)
     return write_all(folder, outcome, outcome.to_dict(seed=seed))
+
+
+def tables(of: Fit | Closing | Posterior | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, pd.DataFrame]:
+    """Every number of a result as pandas DataFrames, by name.
+
+    >>> sb.tables("out")["parameters"].loc["mass:Knee", ["value", "ci95_low", "ci95_high"]]  # doctest: +SKIP
+
+    Parameters
+    ----------
+    of : an outcome, a result, or the folder (or result.json) of a finished run.
+
+    Returns
+    -------
+    dict of str to DataFrame
+        See `sysid_btr.display.tables.to_tables`.
+
+    Raises
+    ------
+    UsageError
+        If there is no result in that folder.
+    """
+    from sysid_btr.display.tables import to_tables
+    from sysid_btr.result import read_result
+
+    if isinstance(of, Mapping):
+        return to_tables(of)
+    return to_tables(read_result(of) if isinstance(of, str | os.PathLike) else of.to_dict())
 
 
 def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[str, Any]) -> Path:

@@ -133,6 +133,23 @@ def test_a_posterior_as_a_datatree(leg: Posterior) -> None:
     np.testing.assert_array_equal(tree["sample_stats"]["lp"].values[0], leg.sample.log_density[0, :, 0])
 
 
+def test_a_datatree_has_what_was_observed_beside_what_is_predicted(leg: Posterior) -> None:
+    from sysid_btr.posterior.export import to_datatree
+
+    tree = to_datatree(leg)
+    band = leg.bands[3]
+    name = f"{band.channel}.{band.joint}"
+    observed, predicted = tree["observed_data"][name], tree["posterior_predictive"][name]
+    np.testing.assert_array_equal(observed.values, band.measured[band.held_out])
+    np.testing.assert_array_equal(observed[f"time_{name}"].values, band.time[band.held_out])
+    assert predicted.dims == ("chain", "draw", *observed.dims)
+    # replicates scatter as the band says, and the replays among them as the draws do
+    spread = predicted.values[0].std(axis=0)
+    expected = np.hypot(band.spread, band.error)[band.held_out]
+    assert np.median(spread / expected) == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_allclose(band.draws.mean(axis=0), band.mean, atol=1e-6)
+
+
 def test_figures_are_drawn_on_axes(leg: Posterior) -> None:
     from sysid_btr.report.posterior import plot_bands, plot_corner, plot_trace
     from sysid_btr.report.style import png

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -119,7 +119,7 @@ class BackToReality:
                 "termination": self.reason,
                 "noise_floor": {"fitness": None},
                 **self._errors(),
-                "parameters": [asdict(e) for e in estimate_model(self)],
+                "parameters": [e.to_dict() for e in estimate_model(self)],
                 "effects": [],
                 "candidates": [],
                 "steps": [],

@@ -19,12 +19,13 @@ from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.uncertainty import with_discrepancy
 from sysid_btr.diagnosis.verdict import conclude, named_effects, verdict_of
 from sysid_btr.errors import LogError
-from sysid_btr.estimators.base import Progress, silent
+from sysid_btr.estimators.base import Progress
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import Study
 from sysid_btr.io._text import some
 from sysid_btr.io.noise import is_white
+from sysid_btr.progress import shows_progress, watched
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import COMMANDS, GROUND, Effect
 from sysid_btr.terms.free_form import FREE_FORMS
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log
 
 
+@shows_progress("close")
 def close(
     study: Study,
     parameters: Sequence[str] | Sequence[Term],
@@ -43,7 +45,7 @@ def close(
     effects: Sequence[str] = ("all",),
     rng: Generator | None = None,
     journal: Journal | None = None,
-    progress: Progress = silent,
+    progress: Progress = watched,
     start: FloatArray | None = None,
     selection: Selection = STANDARD,
 ) -> Closing:

@@ -93,7 +93,7 @@ class StepRecord:
     holdout: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Closing(StudyOutcome):
     """Result of closing the loop.
 
@@ -131,6 +131,11 @@ class Closing(StudyOutcome):
     seconds: float
 
     @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """All of the model that is reported: the declared parameters, then those of the effects."""
+        return (*self.parameters, *(p for e in self.effects for p in e.parameters))
+
+    @property
     def values(self) -> FloatArray:
         """(p,) values of all parameters of the final model."""
         return self.model.values
@@ -146,8 +151,8 @@ class Closing(StudyOutcome):
             "nominal": self.nominal.to_dict(),
             "before": self.before.to_dict(),
             "after": self.after.to_dict(),
-            "parameters": [asdict(e) for e in self.parameters],
-            "effects": [asdict(e) for e in self.effects],
+            "parameters": [e.to_dict() for e in self.parameters],
+            "effects": [{**asdict(e), "parameters": [p.to_dict() for p in e.parameters]} for e in self.effects],
             "candidates": [asdict(c) for c in self.candidates],
             "steps": [asdict(s) for s in self.steps],
             "signature": self.signature,

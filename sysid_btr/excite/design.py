@@ -20,7 +20,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, silent
+from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
@@ -38,6 +38,7 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import FITTED, WARM_UP, Target, make_targets
+from sysid_btr.progress import shows_progress, watched
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Parameter
@@ -381,6 +382,7 @@ class Design:
         return float(np.mean(self.ratios[self.identifiable])) if any(self.identifiable) else 1.0
 
 
+@shows_progress("excite")
 def design(
     robot: Robot,
     parameters: Sequence[str],
@@ -393,7 +395,7 @@ def design(
     rng: Generator | None = None,
     budget: Budget | None = None,
     journal: Journal | None = None,
-    progress: Progress = silent,
+    progress: Progress = watched,
     threads: int = 0,
     search_context: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> Design:

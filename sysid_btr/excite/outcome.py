@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,7 +64,7 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
             "message": message(design),
             "termination": design.result.termination.value,
             "parameters": [
-                {**asdict(a), "reference": _uncertainty(b), "ratio": float(ratio) if known else None}
+                {**a.to_dict(), "reference": _uncertainty(b), "ratio": float(ratio) if known else None}
                 for a, b, ratio, known in zip(after, before, design.ratios, design.identifiable, strict=True)
             ],
             "effects": [],
@@ -103,7 +102,7 @@ def make_result(design: Design, *, seed: int = 0) -> dict[str, Any]:
 
 
 def _uncertainty(estimate: Estimate) -> dict[str, Any]:
-    entry = asdict(estimate)
+    entry = estimate.to_dict()
     return {key: entry[key] for key in ("std", "ci95", "identifiable", "reason")}
 
 

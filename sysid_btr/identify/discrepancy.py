@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.intervals import Estimate, correlations
 from sysid_btr.identify.missing_torque import (
     MissingTorque,
     TorqueResponse,
@@ -181,7 +181,7 @@ def widened(
     steep, rest = white[:, :-1], white[:, -1]
     shift = newton(steep, rest)
     cov, _ = spread(steep, rest + steep @ shift, blocks)
-    std = np.sqrt(np.diag(cov))
+    std, together = np.sqrt(np.diag(cov)), correlations(cov)
     result = []
     for i, (one, parameter) in enumerate(zip(found, parameters, strict=True)):
         own = max(one.std, float(np.hypot(shift[i], std[i])))
@@ -193,6 +193,7 @@ def widened(
                 one,
                 std=min(own, span),
                 std_if_right=one.std,
+                correlation=tuple(map(float, together[i])),
                 ci95=(min(low, one.ci95[0]), max(high, one.ci95[1])),
                 identifiable="weak" if one.identifiable == "yes" and own > parameter.scale else one.identifiable,
                 reason=one.reason

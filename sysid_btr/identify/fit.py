@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, silent, uses_residuals
+from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, uses_residuals
 from sysid_btr.estimators.chain import Chain, needs_residuals
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
@@ -29,6 +29,7 @@ from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.progress import shows_progress, watched
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model, Terms
 from sysid_btr.units import si_all
@@ -41,7 +42,7 @@ RISES = 1.01
 """Ratio of errors beyond which one is said to rise: less is a matter of the numerics."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit(StudyOutcome):
     """Declared parameters fitted to a study.
 
@@ -71,6 +72,11 @@ class Fit(StudyOutcome):
     seconds: float
     optimum: FloatArray
     profiles: tuple[Profile, ...] = ()
+
+    @property
+    def parameters(self) -> tuple[Estimate, ...]:
+        """The declared parameters, as in result.json: here these are all `estimates`."""
+        return self.estimates
 
     @property
     def values(self) -> FloatArray:
@@ -114,7 +120,7 @@ class Fit(StudyOutcome):
             "before": before,
             "after": before,
             "parameters": [
-                {**asdict(e), "numerics_shift": float(shift)}
+                {**e.to_dict(), "numerics_shift": float(shift)}
                 for e, shift in zip(self.estimates, self.numerics_shift, strict=True)
             ],
             "effects": [],
@@ -126,6 +132,7 @@ class Fit(StudyOutcome):
         }
 
 
+@shows_progress("fit")
 def fit(
     study: Study,
     parameters: Sequence[str] | Sequence[Term],
@@ -134,7 +141,7 @@ def fit(
     rng: Generator | None = None,
     budget: Budget | None = None,
     journal: Journal | None = None,
-    progress: Progress = silent,
+    progress: Progress = watched,
     start: FloatArray | None = None,
     distance: Distance | None = None,
 ) -> Fit:
@@ -147,7 +154,8 @@ def fit(
     estimator : default least squares.
     rng : for estimators that draw; default seed 0.
     budget, journal, progress : see `sysid_btr.estimators`. The budget is that of all searches of the fit together; what
-        prepares them (numerics, the realisation of a servo) and what describes their result is not counted.
+        prepares them (numerics, the realisation of a servo) and what describes their result is not counted. Without
+        `progress` a line is shown where stderr is a terminal or a notebook; `silent` shows none.
     start : (p,) where to begin; default the nominal values.
     distance : minimised instead of the whitened squares (MSE, phi2), by an estimator that needs no residuals.
         Intervals are then those of the likelihood at the point found.

@@ -6,7 +6,7 @@ The covariance is that of `objectives.covariance`, widened by what halving the s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -32,6 +32,8 @@ class Estimate:
     at_bound : whether the estimate lies on a bound.
     reason : why it is not identifiable, or what limits it; empty otherwise.
     std_if_right : standard error if the model were right, where `std` and `ci95` hold for what it lacks too; else None.
+    correlation : of its error with that of each parameter estimated beside it, itself included, in their order; NaN
+        where nothing is known. Empty where it was not worked out.
     """
 
     name: str
@@ -45,6 +47,33 @@ class Estimate:
     at_bound: bool
     reason: str
     std_if_right: float | None = None
+    correlation: tuple[float, ...] = field(default=(), repr=False, compare=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As results have it; they have the correlations of all parameters in one matrix."""
+        return {name: value for name, value in asdict(self).items() if name != "correlation"}
+
+
+def correlations(covariance: FloatArray) -> FloatArray:
+    """Correlation matrix (p, p) of a covariance; NaN beside a variance that is infinite."""
+    deviation = np.sqrt(np.diag(covariance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = covariance / np.outer(deviation, deviation)
+    found[~np.isfinite(deviation)], found[:, ~np.isfinite(deviation)] = np.nan, np.nan
+    return np.asarray(np.clip(found, -1.0, 1.0))
+
+
+def correlation_matrix(found: Sequence[Estimate]) -> FloatArray:
+    """Correlations (p, p) of estimates that were made together; NaN where nothing is known."""
+    size = len(found)
+    rows = [e.correlation if len(e.correlation) == size else (np.nan,) * size for e in found]
+    return np.array(rows, dtype=np.float64).reshape(size, size)
+
+
+def covariance_matrix(found: Sequence[Estimate]) -> FloatArray:
+    """Covariance (p, p) of estimates that were made together: their standard errors and correlations."""
+    std = np.array([e.std for e in found], dtype=np.float64)
+    return np.asarray(np.outer(std, std) * correlation_matrix(found))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +151,7 @@ def estimates(
         cov[np.ix_(known.which, known.which)] = known.covariance
         quantile[known.which] = student.ppf(0.975, np.inf)
     norm = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
+    together = correlations(cov)
     result = []
     for i, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
         span = parameter.upper - parameter.lower
@@ -145,6 +175,7 @@ def estimates(
                 identifiable=state,
                 at_bound=at_bound,
                 reason=reason or ("the estimate lies on its bound" if at_bound else ""),
+                correlation=tuple(map(float, together[i])),
             )
         )
     return tuple(result)

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from sysid_btr._typing import FloatArray
+from sysid_btr.errors import UsageError
+from sysid_btr.identify.intervals import Estimate, correlation_matrix, covariance_matrix
+from sysid_btr.identify.residuals import residuals
 from sysid_btr.identify.scores import ChannelScore, Scores
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
 from sysid_btr.result import SCHEMA, clean, versions
 from sysid_btr.simulation.numerics import MUJOCO
-from sysid_btr.units import si_all
+from sysid_btr.terms.model import Model
+from sysid_btr.units import si_all, with_digits_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SHOWN = 4
+"""Parameters in a line about an outcome."""
 
 
 def study_result(
@@ -46,6 +57,10 @@ class StudyOutcome:
         @property
         def study(self) -> Study: ...
         @property
+        def model(self) -> Model: ...
+        @property
+        def estimates(self) -> Sequence[Estimate]: ...
+        @property
         def found(self) -> Mapping[str, Any]: ...
         @property
         def replays(self) -> int: ...
@@ -61,7 +76,51 @@ class StudyOutcome:
         wall_s : wall time to record, s; default that of all of it.
         """
         wall_s = self.seconds if wall_s is None else wall_s
-        return study_result(self.study, self.found, seed=seed, replays=self.replays, wall_s=wall_s)
+        matrices = {"covariance": self.covariance, "correlation": self.correlation}
+        return study_result(self.study, {**self.found, **matrices}, seed=seed, replays=self.replays, wall_s=wall_s)
+
+    @property
+    def correlation(self) -> FloatArray:
+        """(p, p) correlations of the errors of `estimates`; NaN where nothing is known of a parameter."""
+        return correlation_matrix(self.estimates)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(p, p) covariance of `estimates`; NaN where nothing is known of a parameter."""
+        return covariance_matrix(self.estimates)
+
+    def to_pandas(self, table: str = "parameters") -> pd.DataFrame:
+        """One of the tables of `sysid_btr.tables`: ``parameters``, ``effects``, ``candidates``, ``joints``, ``run``...
+
+        Raises
+        ------
+        UsageError
+            If there is no such table; the message lists those that there are.
+        """
+        from sysid_btr.display.tables import to_tables
+
+        found = to_tables(self.to_dict())
+        if table not in found:
+            raise UsageError(f"this outcome has no table {table!r}; it has {', '.join(found)}")
+        return found[table]
+
+    def residuals(self) -> pd.DataFrame:
+        """Every sample that was compared with the model, fitted and held out.
+
+        Returns
+        -------
+        DataFrame
+            ``log``, ``episode``, ``part`` (train, holdout), ``channel``, ``joint``, ``time`` (s since the first
+            sample), ``measured``, ``predicted`` by the model found, ``residual`` (their difference) and ``noise`` (its
+            floor), SI.
+        """
+        return residuals(self.study, self.model)
+
+    def __repr__(self) -> str:
+        known = [f"{e.name} {with_digits_of(e.value, e.std)} \u00b1 {e.std:.2g}" for e in self.estimates[:SHOWN]]
+        more = [f"{len(self.estimates) - SHOWN} more"] if len(self.estimates) > SHOWN else []
+        verdict = f"{self.found['verdict']}: " if "verdict" in self.found else ""
+        return f"<{type(self).__name__} of {self.study.robot.name}: {verdict}{', '.join([*known, *more])}>"
 
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import result_html

@@ -23,6 +23,7 @@ from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import Profile
 from sysid_btr.objectives.covariance import RANK, spread
 from sysid_btr.objectives.problem import Conditional
+from sysid_btr.progress import shows_progress, watched
 
 if TYPE_CHECKING:
     from sysid_btr.estimators.base import ResidualProblem
@@ -36,7 +37,8 @@ _MOST = 3
 _ITERATIONS = 6
 
 
-def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = silent) -> Profile:
+@shows_progress("profile")
+def profile(fit: Fit, name: str, points: int = POINTS, *, progress: Progress = watched) -> Profile:
     """The likelihood of a fit along one of its parameters.
 
     Parameters

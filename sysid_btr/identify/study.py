@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.base import Progress, silent
+from sysid_btr.estimators.base import Progress
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
@@ -24,6 +24,7 @@ from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP
+from sysid_btr.progress import shows_progress, watched
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.registry import on_simulator
@@ -36,7 +37,7 @@ from sysid_btr.terms.scales import JointScale, Scales
 TINY = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Study:
     """Data and model of an identification, before anything is estimated.
 
@@ -69,6 +70,10 @@ class Study:
     journal: Journal | None = None
     nuisance: Mapping[str, float] = field(default_factory=dict)
     independent: bool = False
+
+    def __repr__(self) -> str:
+        parts = f"{len(self.train)} episodes fitted, {len(self.holdout)} held out"
+        return f"<Study of {self.robot.name}: {parts}; {', '.join(self.channels)}; {self.numerics}>"
 
     @property
     def leading_channel(self) -> str:
@@ -180,6 +185,7 @@ class Study:
         )
 
 
+@shows_progress("study")
 def make_study(
     robot: Robot,
     logs: Sequence[Log],
@@ -192,7 +198,7 @@ def make_study(
     threads: int = 0,
     executor: Executor = HERE,
     nuisance: Mapping[str, float] | None = None,
-    progress: Progress = silent,
+    progress: Progress = watched,
 ) -> Study:
     """Lay out an identification.
 
@@ -209,7 +215,7 @@ def make_study(
     executor : where candidates are simulated: this process, or what `open_executor` gives.
     nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, as
         ``{"mass": 0.1}``: intervals then do not take them as exact.
-    progress : is told what is going on.
+    progress : is told what is going on; by default a line where stderr is a terminal or a notebook.
 
     Raises
     ------

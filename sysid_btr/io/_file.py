@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
-from sysid_btr.io.log import META_KEYS, SCHEMA_VERSION, Log, LogMeta, closest, is_schema_column
+from sysid_btr.io.log import META_KEYS, SCHEMA_VERSION, Log, LogMeta, closest, is_schema_column, torques_of_currents
 from sysid_btr.io.problem import Problem
 from sysid_btr.memory import require_memory
 from sysid_btr.reading import parse_json
@@ -346,18 +346,6 @@ def _log(table: pa.Table, meta: LogMeta, path: Path, problems: list[Problem]) ->
         return None
     channels |= torques_of_currents(channels, meta)
     return Log(time=time, channels=channels, meta=meta, episode=episode, path=path, unknown=unknown)
-
-
-def torques_of_currents(channels: Mapping[str, FloatArray], meta: LogMeta) -> dict[str, FloatArray]:
-    """`effort` of joints that have a current and, in the metadata, a torque constant, but no effort of their own."""
-    constant = meta.torque_constant
-    found = {}
-    for name, values in channels.items():
-        channel, _, joint = name.partition(".")
-        known = constant.get(joint) if isinstance(constant, Mapping) else constant
-        if channel == "current" and known is not None and f"effort.{joint}" not in channels:
-            found[f"effort.{joint}"] = known * values
-    return found
 
 
 def _time(columns: Mapping[str, pa.ChunkedArray], meta: LogMeta, n: int, problems: list[Problem]) -> FloatArray | None:

@@ -8,15 +8,22 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
+from sysid_btr.io.frames import CLOCK, numbers, seconds, with_time
 from sysid_btr.units import si
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 T = TypeVar("T")
+
+ATTRIBUTE = "sysid_btr"
+"""Key of the metadata in a DataFrame's ``attrs``, as in a file."""
 
 SCHEMA_VERSION = 1
 
@@ -116,7 +123,7 @@ class LogMeta:
         return next((self.units[key] for key in (column, group) if key in self.units), None)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Log:
     """Samples of one recording (or of several, told apart by `episode`).
 
@@ -160,6 +167,66 @@ class Log:
     def __len__(self) -> int:
         return len(self.time)
 
+    @classmethod
+    def from_pandas(cls, table: pd.DataFrame, meta: LogMeta | None = None) -> Log:
+        """A log of a DataFrame with the schema's columns; `sysid_btr.import_log` takes other names and units.
+
+        Parameters
+        ----------
+        table : DataFrame
+            Time (s, timestamps or timedeltas) as the index or as column ``time``; then ``command.<joint>``,
+            ``position.<joint>``, ...; ``episode`` where there are several.
+        meta : LogMeta, optional
+            What is known of it; else what `to_pandas` left in ``table.attrs``, else the defaults.
+
+        Raises
+        ------
+        LogError
+            If there is no time, or a column of the schema holds no numbers; all problems at once.
+        """
+        table = with_time(table)
+        columns = {str(name): table.iloc[:, i] for i, name in enumerate(table.columns)}
+        known = {name: numbers(column) for name, column in columns.items() if is_schema_column(name)}
+        clock = seconds(columns[CLOCK]) if CLOCK in columns and len(table) else None
+        episode = numbers(columns["episode"]) if "episode" in columns else np.zeros(len(table))
+        problems = [
+            f"{name} ({columns[name].dtype}) holds no numbers" for name, found in known.items() if found is None
+        ]
+        if len(columns) < table.shape[1]:
+            problems.append("two columns have one name")
+        if clock is None or not np.isfinite(clock).all():
+            problems.append(f"no time: give seconds, timestamps or durations as column {CLOCK!r} or as the index")
+        if episode is None or not np.array_equal(episode, np.round(episode)):
+            problems.append("episode: number the episodes 0, 1, 2, ...")
+        if problems or clock is None or episode is None:
+            raise LogError(
+                f"the DataFrame is not a log: {'; '.join(problems)}. Its columns: {', '.join(columns) or 'none'}. "
+                "A table with names or units of its own is read by sysid_btr.import_log"
+            )
+        if meta is None:
+            meta = meta_of_json(table.attrs.get(ATTRIBUTE, {}))
+        channels = {name: found for name, found in known.items() if found is not None}
+        unknown = {n: c.to_numpy() for n, c in columns.items() if n not in (*known, CLOCK, "episode")}
+        channels |= torques_of_currents(channels, meta)
+        return cls(clock, channels, meta, episode.astype(np.int64), unknown=unknown)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The samples as a DataFrame: index ``time`` (s), one column a channel, ``episode`` where there are several.
+
+        Its ``attrs`` hold the metadata, so that `from_pandas` gives the same log.
+        """
+        import pandas as pd
+
+        episodes = {"episode": self.episode} if np.any(self.episode != 0) else {}
+        table = pd.DataFrame({**episodes, **self.channels, **self.unknown}, index=pd.Index(self.time, name=CLOCK))
+        table.attrs[ATTRIBUTE] = meta_to_json(self.meta)
+        return table
+
+    def __repr__(self) -> str:
+        joints = len({name.partition(".")[2] for name in self.channels})
+        kinds = ", ".join(dict.fromkeys(name.partition(".")[0] for name in self.channels))
+        return f"<Log of {self.meta.robot or 'a robot'}: {self._facts['samples']}; {kinds} ({joints} names)>"
+
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import facts_html
 
@@ -170,13 +237,17 @@ class Log:
         """What was recorded, for how long, and which joints moved."""
         facts = {
             "robot": self.meta.robot or "not said",
-            "samples": f"{len(self)} in {len(self.episodes())} episode(s), {self.time[-1] - self.time[0]:.1f} s",
+            "samples": f"{len(self)} samples in {len(self.episodes())} episode(s), {self._seconds:.1f} s",
             "sampled every": si(float(np.median(np.diff(self.time))), "s") if len(self) > 1 else "-",
             "base": self.meta.mount,
         }
         for kind in dict.fromkeys(name.partition(".")[0] for name in self.channels):
             facts[kind] = ", ".join(self.joints(kind))
         return facts
+
+    @property
+    def _seconds(self) -> float:
+        return float(np.ptp(self.time)) if len(self) else 0.0
 
     @property
     def is_motion(self) -> bool:
@@ -271,6 +342,42 @@ class Log:
 
 META_KEYS = tuple(f.name for f in fields(LogMeta) if f.name != "extra")
 """Metadata keys of the schema."""
+
+
+ALWAYS_WRITTEN = ("schema", "robot", "mount", "source")
+"""Of them, those that a file states in any case."""
+
+
+def meta_to_json(meta: LogMeta) -> dict[str, Any]:
+    """Metadata as the JSON object of the schema; what is at its default is left out, unknown keys are kept."""
+    default = LogMeta()
+    known = {
+        f.name: getattr(meta, f.name)
+        for f in fields(LogMeta)
+        if f.name != "extra" and (f.name in ALWAYS_WRITTEN or getattr(meta, f.name) != getattr(default, f.name))
+    }
+    for name, value in known.items():
+        if isinstance(value, Mapping):
+            known[name] = dict(value)
+    return {**known, **{key: value for key, value in meta.extra.items() if key not in known}}
+
+
+def meta_of_json(known: Mapping[str, Any]) -> LogMeta:
+    """Metadata of what `meta_to_json` gave."""
+    extra = {key: value for key, value in known.items() if key not in META_KEYS}
+    return LogMeta(**{key: value for key, value in known.items() if key in META_KEYS}, extra=extra)
+
+
+def torques_of_currents(channels: Mapping[str, FloatArray], meta: LogMeta) -> dict[str, FloatArray]:
+    """`effort` of joints that have a current and, in the metadata, a torque constant, but no effort of their own."""
+    constant = meta.torque_constant
+    found = {}
+    for name, values in channels.items():
+        channel, _, joint = name.partition(".")
+        known = constant.get(joint) if isinstance(constant, Mapping) else constant
+        if channel == "current" and known is not None and f"effort.{joint}" not in channels:
+            found[f"effort.{joint}"] = known * values
+    return found
 
 
 def is_schema_column(name: str) -> bool:

@@ -6,24 +6,20 @@ import hashlib
 import json
 import os
 import secrets
-from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._file import METADATA_KEY, load
-from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.log import Log, meta_to_json
 from sysid_btr.io.problem import errors_of, explain
 from sysid_btr.io.validation import validate_log
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-_ALWAYS_WRITTEN = ("schema", "robot", "mount", "source")
 
 
 def read_log(path: str | os.PathLike[str], *, check: bool = True) -> Log:
@@ -123,20 +119,6 @@ def sha256(path: str | os.PathLike[str]) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror}") from error
-
-
-def meta_to_json(meta: LogMeta) -> dict[str, Any]:
-    """Metadata as the JSON object of the schema; what is at its default is left out, unknown keys are kept."""
-    default = LogMeta()
-    known = {
-        f.name: getattr(meta, f.name)
-        for f in fields(LogMeta)
-        if f.name != "extra" and (f.name in _ALWAYS_WRITTEN or getattr(meta, f.name) != getattr(default, f.name))
-    }
-    for name, value in known.items():
-        if isinstance(value, Mapping):
-            known[name] = dict(value)
-    return {**known, **{key: value for key, value in meta.extra.items() if key not in known}}
 
 
 def _column(name: str, values: FloatArray) -> pa.Array:

@@ -10,7 +10,7 @@ from sysid_btr.io._text import some
 from sysid_btr.io._tracking import distance, trackings
 from sysid_btr.io.log import Log
 from sysid_btr.io.problem import Problem, errors_of, explain, worst_first
-from sysid_btr.io.validation import validate_log
+from sysid_btr.io.validation import validate_log as _of_content
 from sysid_btr.models.commands import FED_FORWARD, command_columns, commanded, driven_by_effort
 from sysid_btr.models.pose import standing
 from sysid_btr.models.robot import Robot, joint_names, joint_ranges
@@ -29,7 +29,7 @@ def check_log(robot: Robot, log: Log) -> tuple[Problem, ...]:
     """Problems of a log for one robot, worst first: the one list that all verbs have."""
     robot = robot.for_log(log)
     drives = joint_drives(robot.model)
-    content = validate_log(
+    content = _of_content(
         log,
         joints=joint_names(robot),
         ranges=joint_ranges(robot),
@@ -38,6 +38,24 @@ def check_log(robot: Robot, log: Log) -> tuple[Problem, ...]:
         at=standing(robot, log),
     )
     return worst_first((*content, *command_problems(robot, log)))
+
+
+def validate_log(log: Log, robot: Robot | None = None) -> tuple[Problem, ...]:
+    r"""Everything that is wrong with a log, where it is and what to do, as ``sysid-btr validate`` says it.
+
+    >>> print(*sb.validate_log(log, sb.load_robot("leg.xml")), sep="\n")  # doctest: +SKIP
+
+    Parameters
+    ----------
+    log : recording.
+    robot : model to check it against: joints, ranges, and what the commands drive.
+
+    Returns
+    -------
+    tuple of Problem
+        Errors first; empty for a good log.
+    """
+    return _of_content(log) if robot is None else check_log(robot, log)
 
 
 def require_drives(robot: Robot, logs: Iterable[Log]) -> None:

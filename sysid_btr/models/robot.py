@@ -29,7 +29,7 @@ Position = str | tuple[str, float]
 """A joint and where it stands, rad or m; or a pose of the model, for all of them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Robot:
     """A model that can be compiled, and its table of what identification needs to know.
 
@@ -63,6 +63,9 @@ class Robot:
     at: tuple[Position, ...] = ()
     remarks: tuple[str, ...] = ()
     drives_stated: bool = True
+
+    def __repr__(self) -> str:
+        return f"<Robot {self.name}{'' if self.path is None else f' ({self.path})'}>"
 
     def _repr_html_(self) -> str:
         from sysid_btr.display.html import facts_html

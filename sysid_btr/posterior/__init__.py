@@ -3,17 +3,26 @@
 >>> import sysid_btr as sb
 >>> drawn = sb.posterior(sb.fit(study, ["mass:*Knee*", "kp:*=shared"]))  # doctest: +SKIP
 
-``sysid_btr.posterior`` is this package, and the function at the same time: calling the package calls the function.
+``sysid_btr.posterior`` is this package, and the function at the same time: calling the package calls the function,
+``sb.posterior(fit, priors=..., settings=..., rng=..., budget=..., journal=..., progress=...)``.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from sysid_btr.progress import watched
+
 if TYPE_CHECKING:
+    from numpy.random import Generator
+
+    from sysid_btr.estimators.base import Budget, Progress
+    from sysid_btr.estimators.journal import Journal
+    from sysid_btr.identify.fit import Fit
     from sysid_btr.posterior.draw import posterior
     from sysid_btr.posterior.export import to_datatree
     from sysid_btr.posterior.outcome import Posterior
@@ -35,10 +44,23 @@ class _Package(ModuleType):
     two were imported.
     """
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Posterior:
+    def __call__(
+        self,
+        fit: Fit,
+        *,
+        priors: Mapping[str, str] | None = None,
+        settings: Settings | None = None,
+        rng: Generator | None = None,
+        budget: Budget | None = None,
+        journal: Journal | None = None,
+        progress: Progress = watched,
+    ) -> Posterior:
+        """Draw the posterior of the parameters of a fit, see `sysid_btr.posterior.posterior`."""
         from sysid_btr.posterior.draw import posterior
 
-        return posterior(*args, **kwargs)
+        return posterior(
+            fit, priors=priors, settings=settings, rng=rng, budget=budget, journal=journal, progress=progress
+        )
 
 
 sys.modules[__name__].__class__ = _Package

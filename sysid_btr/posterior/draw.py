@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget, Progress, silent
+from sysid_btr.estimators.base import Budget, Progress
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
-from sysid_btr.identify.intervals import Estimate, identifiability
+from sysid_btr.identify.intervals import Estimate, correlations, identifiability
 from sysid_btr.identify.scores import score
 from sysid_btr.posterior.likelihood import make_likelihood, settle
 from sysid_btr.posterior.outcome import Posterior
 from sysid_btr.posterior.predictive import coverage, predict_bands
 from sysid_btr.posterior.priors import choose_priors
 from sysid_btr.posterior.sampling import Sample, Settings, sample
+from sysid_btr.progress import shows_progress, watched
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -31,6 +32,7 @@ AT_BOUND = (0.1, 0.04)
 """At its bound: more than this share (second) of the draws within this many standard deviations of it."""
 
 
+@shows_progress("posterior")
 def posterior(
     fit: Fit,
     *,
@@ -39,7 +41,7 @@ def posterior(
     rng: Generator | None = None,
     budget: Budget | None = None,
     journal: Journal | None = None,
-    progress: Progress = silent,
+    progress: Progress = watched,
 ) -> Posterior:
     """Draw the posterior of the parameters of a fit, each draw a real replay of the training data.
 
@@ -105,6 +107,7 @@ def _estimates(fit: Fit, drawn: Sample, jacobian: FloatArray) -> tuple[Estimate,
     mean, std = flat.mean(axis=0), flat.std(axis=0)
     low, high = np.quantile(flat, [0.025, 0.975], axis=0)
     covariance = np.atleast_2d(np.cov(flat.T))
+    together = correlations(covariance)
     norm = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
     result = []
     for i, parameter in enumerate(parameters):
@@ -124,6 +127,7 @@ def _estimates(fit: Fit, drawn: Sample, jacobian: FloatArray) -> tuple[Estimate,
                 identifiable=state,
                 at_bound=at_bound,
                 reason=reason or ("the posterior piles up at its bound" if at_bound else ""),
+                correlation=tuple(map(float, together[i])),
             )
         )
     return tuple(result)

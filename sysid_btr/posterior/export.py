@@ -12,9 +12,14 @@ from sysid_btr.optional import optional
 from sysid_btr.version import __version__
 
 if TYPE_CHECKING:
+    from numpy.random import Generator
+
     from sysid_btr.posterior.outcome import Posterior
+    from sysid_btr.posterior.predictive import Band
 
 SCHEMA = "sysid_btr.posterior/1"
+NOISE_SEED = 0
+"""Of the noise in `posterior_predictive`, so that a posterior is always written to the same numbers."""
 
 
 def check_installed() -> None:
@@ -38,7 +43,9 @@ def to_datatree(posterior: Posterior) -> Any:
         Group ``posterior``: one variable a parameter, dimensions ``chain`` and ``draw``. A chain is a walker, as in
         `arviz_base.from_emcee`; coordinate ``ensemble`` says of which ensemble. Walkers of one ensemble are not
         independent: the R-hat and autocorrelation times that count are attributes of each variable. Group
-        ``sample_stats``: ``lp``, the log density, and ``log_likelihood``, both up to a constant.
+        ``sample_stats``: ``lp``, the log density, and ``log_likelihood``, both up to a constant. ``observed_data``:
+        every held-out sensor, ``channel.joint``, with its own times (s). ``posterior_predictive``: the same as
+        predicted by a few draws, with noise as large as the error that the fitted model leaves of fitted data.
 
     Raises
     ------
@@ -53,11 +60,16 @@ def to_datatree(posterior: Posterior) -> Any:
     def as_chains(array: Any) -> Any:
         return np.moveaxis(array, 2, 1).reshape(ensembles * walkers, steps)
 
+    observed, rng = _observed(posterior), np.random.default_rng(NOISE_SEED)
     tree = base.from_dict(
         {
+            "observed_data": {name: band.measured[band.held_out] for name, band in observed.items()},
+            "posterior_predictive": {name: _replicates(band, rng) for name, band in observed.items()},
             "posterior": {name: as_chains(drawn.draws[..., j]) for j, name in enumerate(names)},
             "sample_stats": {"lp": as_chains(drawn.log_density), "log_likelihood": as_chains(drawn.log_likelihood)},
         },
+        dims={name: [f"time_{name}"] for name in observed},
+        coords={f"time_{name}": band.time[band.held_out] for name, band in observed.items()},
         check_conventions=False,  # many short chains are what an ensemble is
         attrs={
             "/": {
@@ -88,6 +100,17 @@ def to_datatree(posterior: Posterior) -> Any:
             }
         )
     return tree
+
+
+def _observed(posterior: Posterior) -> dict[str, Band]:
+    """Held-out sensors by the name of their variable."""
+    return {variable_name(f"{band.channel}.{band.joint}"): band for band in posterior.bands}
+
+
+def _replicates(band: Band, rng: Generator) -> Any:
+    """What a sensor may show, (1, draws, held-out samples)."""
+    replays = band.draws[:, band.held_out]
+    return (replays + rng.normal(scale=band.error, size=replays.shape)).astype(np.float32)[None]
 
 
 def netcdf(posterior: Posterior) -> bytes:

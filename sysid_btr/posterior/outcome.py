@@ -18,12 +18,13 @@ from sysid_btr.posterior.likelihood import Likelihood
 from sysid_btr.posterior.predictive import Band
 from sysid_btr.posterior.priors import Prior, moments
 from sysid_btr.posterior.sampling import Sample
+from sysid_btr.terms.model import Model
 
 NOTICEABLE_GAIN = 2.0
 """Log-likelihood of a draw over the fit's beyond which the fit was not the minimum."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Posterior(StudyOutcome):
     """Draws of the posterior of a fit's parameters.
 
@@ -60,9 +61,19 @@ class Posterior(StudyOutcome):
         return self.fit.study
 
     @property
+    def model(self) -> Model:
+        """The terms at the posterior means."""
+        return self.fit.model.at(self.values)
+
+    @property
+    def parameters(self) -> tuple[Estimate, ...]:
+        """The declared parameters, as in result.json: here these are all `estimates`."""
+        return self.estimates
+
+    @property
     def as_fit(self) -> Fit:
         """The model of the posterior means, where a fit is asked for."""
-        return replace(self.fit, model=self.fit.model.at(self.values), estimates=self.estimates, before=self.after)
+        return replace(self.fit, model=self.model, estimates=self.estimates, before=self.after)
 
     @property
     def converged(self) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.mujoco_conventions import slides
@@ -36,6 +37,7 @@ class Band:
     mean, spread : (n,) of the replays under draws of the posterior: what is not known of the parameters.
     error : standard deviation of the fitted model's error on the data it was fitted to, at least the noise floor.
     held_out : (n,) samples that count.
+    draws : (m, n) the replays under draws of the posterior; NaN where one diverges.
     """
 
     channel: str
@@ -47,6 +49,7 @@ class Band:
     spread: FloatArray
     error: float
     held_out: BoolArray
+    draws: NDArray[np.float32]
 
     @property
     def half_width(self) -> FloatArray:
@@ -81,15 +84,17 @@ def predict_bands(study: Study, model: Model, draws: FloatArray) -> tuple[Band, 
     for episode in study.holdout_problem(model).episodes:
         log = episode.replay.log
         sums = [np.zeros((3, *t.mask.shape)) for t in episode.targets]
-        for _, outputs in episode.replay.chunks(draws):
-            for total, target in zip(sums, episode.targets, strict=True):
+        kept = [np.empty((len(draws), *t.mask.shape), dtype=np.float32) for t in episode.targets]
+        for rows, outputs in episode.replay.chunks(draws):
+            for total, all_shown, target in zip(sums, kept, episode.targets, strict=True):
                 shown = target.predicted(outputs)
+                all_shown[rows] = shown
                 shown = shown[np.isfinite(shown[:, target.mask]).all(axis=1)]
                 # about the measured signal: sums of squares of small numbers lose no digits
                 off = np.nan_to_num(shown) - np.nan_to_num(target.measured)
                 total += np.stack([np.full(target.mask.shape, float(len(off))), off.sum(0), (off**2).sum(0)])
         label = f" ({log.path.stem})" if several and log.path is not None else ""
-        for (count, first, second), target in zip(sums, episode.targets, strict=True):
+        for (count, first, second), all_shown, target in zip(sums, kept, episode.targets, strict=True):
             safe = np.maximum(count, 1.0)
             mean, square = first / safe, second / safe
             spread = np.sqrt(np.maximum(square - mean**2, 0.0))
@@ -106,6 +111,7 @@ def predict_bands(study: Study, model: Model, draws: FloatArray) -> tuple[Band, 
                         spread=spread[:, k],
                         error=max(error.get((target.channel, joint), 0.0), float(target.noise[k])),
                         held_out=target.mask[:, k],
+                        draws=all_shown[:, :, k],
                     )
                 )
     return tuple(bands)

@@ -39,7 +39,7 @@ class KnownModel:
     sliding: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Imported:
     """A foreign log as one of the schema.
 
@@ -57,6 +57,10 @@ class Imported:
     remarks: tuple[str, ...]
     problems: tuple[Problem, ...]
     advice: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        found = f"{len(errors_of(self.problems))} errors, {len(self.problems)} findings, {len(self.remarks)} remarks"
+        return f"<Imported {self.log!r}: {found}>"
 
     @property
     def usable(self) -> bool:
