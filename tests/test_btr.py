@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid_btr.btr.choice import Pool, disagreement, fittest, pool_of
+from sysid_btr.btr.choice import Choice, Offer, Pool, disagreement, fittest, pool_of
 from sysid_btr.btr.closing import Joined, _tell_apart, join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
@@ -270,16 +270,23 @@ def test_trials_come_from_the_last_generation_first_and_never_twice() -> None:
     assert pool.expected.tolist() == [5.0, 4.0, 2.0]
 
 
+def chosen_by(choice: Choice, offer: Offer, count: int) -> list[int]:
+    taken: list[int] = []
+    while len(taken) < count and (row := choice(offer, taken, count)) is not None:
+        taken.append(row)
+    return taken
+
+
 def test_disagreement_takes_the_fittest_and_those_that_tell_models_apart() -> None:
     pool = Pool(np.arange(10.0)[:, None], np.arange(10.0)[::-1])
 
     def rivals(some: np.ndarray) -> np.ndarray:
         return np.stack([np.zeros(len(some)), np.where(some[:, 0] == 5, 3.0, 0.01 * some[:, 0])])
 
-    assert fittest(pool, 3, rivals) == [0, 1, 2]
-    chosen = disagreement(pool, 3, rivals)
-    assert chosen[:2] == [0, 5]
-    assert disagreement(pool, 20, rivals) == list(range(10))
+    offer = Offer(pool, rivals)
+    assert chosen_by(fittest, offer, 3) == [0, 1, 2]
+    assert chosen_by(disagreement, offer, 3)[:2] == [0, 5]
+    assert sorted(chosen_by(disagreement, offer, 20)) == list(range(10))
 
 
 def test_the_linear_correction_learns_a_linear_discrepancy() -> None:

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.models.robot import Robot
 from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
+UNMEASURED: Mapping[str, float] = {"foot_compliance": 1.0, "foot_friction": 0.2, "command_delay": 0.02}
+"""What no trial measures by itself, or nobody declares: effect -> standard deviation about its neutral value.
+
+A ground is as soft as nobody knows; grass, carpet and tiles under rubber differ by tens of percent in friction; a bus
+and a servo's own cycle take a few periods of 10 to 20 ms.
+"""
 WIDTH = 3.0
 """Standard deviation of a parameter before anything is known, in changes that matter (`Parameter.scale`)."""
+
+ACCEPTED = 3.0
+"""Noise floors of a residual at which half of what a fit says is believed; up to there nothing is looked for
+(`closing.EXPLAINED`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +62,34 @@ class Belief:
         """
         found = Terms(terms)
         return cls(found.parameters, found.nominal, np.diag((width * found.scale) ** 2))
+
+    @classmethod
+    def unmeasured(cls, robot: Robot, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Belief]:
+        """What may differ beside the terms of a model, and how much: the ground, and late commands.
+
+        Parameters
+        ----------
+        robot : that has it.
+        terms : of the model; what is among them is not there twice.
+        """
+        there = {term.name for term in terms}
+        found: list[Term] = []
+        for effect in select_effects([name for name in UNMEASURED if name not in there] or ["all"]):
+            places = robot.names(effect.scope)
+            if effect.name in UNMEASURED and effect.name not in there and places:
+                found.append(effect(places=places, shared=len(places) > 1))
+        std = np.array([UNMEASURED[term.name] for term in found for _ in term.parameters])
+        listed = Terms(found)
+        return tuple(found), cls(listed.parameters, listed.nominal, np.diag(std**2))
+
+    def towards(self, found: FloatArray, noise: float) -> Belief:
+        """The belief where a fit found other values that leave a residual of so many noise floors.
+
+        What leaves more than noise is, for all that anybody knows, about something else than these parameters: it
+        moves the mean the less the more it leaves, and does not narrow the belief.
+        """
+        share = ACCEPTED**2 / (ACCEPTED**2 + noise**2) if np.isfinite(noise) else 1.0
+        return replace(self, mean=self.mean + share * (found - self.mean))
 
     @property
     def std(self) -> FloatArray:

@@ -8,7 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.btr.foresight import Foresight
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.journal import Record
 
@@ -52,38 +53,78 @@ def pool_of(records: Sequence[Record], known: set[bytes]) -> Pool:
     return Pool(np.array(rows).reshape(len(rows), width), -np.array(losses))
 
 
-class Choice(Protocol):
-    """How the controllers to be tried are chosen."""
+@dataclass(frozen=True, eq=False)
+class Offer:
+    """Controllers that may be tried next, and what is known of them.
 
-    def __call__(self, pool: Pool, count: int, rivals: Callable[[FloatArray], FloatArray]) -> list[int]:
-        """Rows of at most `count` controllers; `rivals` gives their fitness (k, m) in k candidate models."""
+    Attributes
+    ----------
+    pool : of the search, best of the last generation first.
+    rivals : gives the fitness (k, m) of controllers (m, p) in k candidate models.
+    foresight : of the pool, given all trials so far; None where there is one model only.
+    near : (n,) whether a controller is near enough to what has worked.
+    best : largest fitness of a trial that stood, m/s; zero before, for a robot that stands still.
+    """
+
+    pool: Pool
+    rivals: Callable[[FloatArray], FloatArray]
+    foresight: Foresight | None = None
+    near: BoolArray | None = None
+    best: float = 0.0
+
+
+class Choice(Protocol):
+    """How the controllers to be tried are chosen, one after the other."""
+
+    def __call__(self, offer: Offer, taken: Sequence[int], count: int) -> int | None:
+        """Row of the next controller, not one of those `taken` in this iteration, of `count`; None if none is left."""
         ...
 
 
-def fittest(pool: Pool, count: int, rivals: Callable[[FloatArray], FloatArray]) -> list[int]:
+def fittest(offer: Offer, taken: Sequence[int], count: int) -> int | None:
     """In order of descending expected fitness, generation by generation from the last (the paper)."""
-    return list(range(min(count, len(pool.expected))))
+    return next((i for i in range(len(offer.pool.expected)) if i not in taken), None)
 
 
 SHORTLIST = 4
 """Times as many controllers as are tried are looked at for disagreement."""
 
 
-def disagreement(pool: Pool, count: int, rivals: Callable[[FloatArray], FloatArray]) -> list[int]:
+def disagreement(offer: Offer, taken: Sequence[int], count: int) -> int | None:
     """The fittest one, and of the fittest those on whose fitness candidate models disagree most.
 
     Estimation-Exploration: Bongard and Lipson 2005, doi:10.1109/TEVC.2005.850293.
     """
-    order = np.argsort(-pool.expected, kind="stable")[: SHORTLIST * count]
-    if len(order) <= count:
-        return [int(i) for i in order]
-    fitness = rivals(pool.controllers[order])
+    order = np.argsort(-offer.pool.expected, kind="stable")[: SHORTLIST * count]
+    fitness = offer.rivals(offer.pool.controllers[order])
     spread = np.nan_to_num(np.std(fitness, axis=0), nan=np.inf) if len(fitness) > 1 else np.zeros(len(order))
-    spread[0] = np.inf
-    return [int(order[i]) for i in np.argsort(-spread, kind="stable")[:count]]
+    spread[:1] = np.inf
+    return next((int(i) for i in order[np.argsort(-spread, kind="stable")] if i not in taken), None)
 
 
-CHOICES: Mapping[str, Choice] = {"fittest": fittest, "disagreement": disagreement}
+SAFE = 0.7
+"""Chance to stand that a controller should have, if there is one that does."""
+
+
+def improvement(offer: Offer, taken: Sequence[int], count: int) -> int | None:
+    """The largest expected improvement times the chance to stand, of what is near enough to what has worked.
+
+    Bayesian optimisation under a constraint (Gelbart et al. 2014, arXiv 1403.5607).
+    """
+    if offer.foresight is None:
+        raise UsageError("btr: the choice 'improvement' weighs what drawn models say: take at least 2 draws")
+    free = np.ones(len(offer.pool.expected), dtype=bool)
+    free[list(taken)] = False
+    stands = offer.foresight.stands
+    for wish in (offer.near, stands >= min(SAFE, float(np.max(stands[free], initial=0.0)))):
+        if wish is not None and (free & wish).any():
+            free &= wish
+    if not free.any():
+        return None
+    return int(np.argmax(np.where(free, offer.foresight.improvement(offer.best), -np.inf)))
+
+
+CHOICES: Mapping[str, Choice] = {"fittest": fittest, "disagreement": disagreement, "improvement": improvement}
 
 
 def get_choice(name: str) -> Choice:

@@ -17,19 +17,24 @@ from time import perf_counter
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.btr.choice import Pool, get_choice, pool_of
+from sysid_btr.btr.belief import Belief
+from sysid_btr.btr.choice import Offer, Pool, get_choice, pool_of
 from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
+from sysid_btr.btr.foresight import Foreseen
 from sysid_btr.btr.map_problem import MapProblem
 from sysid_btr.btr.outcome import BackToReality, Iteration
+from sysid_btr.btr.outlook import Imagination, Outlook
 from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
+from sysid_btr.btr.robust import RobustProblem
 from sysid_btr.btr.settings import LIKELIHOOD, Settings
 from sysid_btr.btr.study import early, early_logs, trial_study
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
+from sysid_btr.btr.trust import Region
 from sysid_btr.btr.world import make_world
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, silent
@@ -37,17 +42,27 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot as RobotModel
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
+from sysid_btr.units import probability
 from sysid_btr.version import __version__
 
 PATIENCE = 3
 """Iterations without progress after which disengagement is looked for."""
 UNCORRELATED = 0.2
 """Rank correlation of expected and real fitness up to which the model does not predict which controller is better."""
+HELD = 0.5
+"""Share of trials within their 90 % interval from which what was foreseen is not lost, whatever the order."""
 STUCK = 0.9
 """What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
 
-STEPS = {"controllers": 1, "models": 3, "models_again": 4}
+STEPS = {"models_drawn": 0, "controllers": 1, "outlook": 2, "models": 3, "models_again": 4}
 """Searches of an iteration by the paper's numbers; with a likelihood Step 3 goes on where effects joined the model."""
+SHORTLIST = 3
+"""Times as many controllers as are tried, the fittest of Step 1, among which Step 2 chooses."""
+ASSESSED = 2
+"""Times as many drawn models as Step 1 has in which the fittest are looked at once more: chosen for what they do in the
+first few, they do it less well in others."""
+REMEMBERED = 24
+"""Trials, the newest, from which it is learnt by how much model and robot differ."""
 SPOILT = 1.5
 """Times the error of the fitness that the last model foresees of the trials, above which a model is not taken."""
 
@@ -119,6 +134,7 @@ class _Loop:
         self.values = np.array([p.nominal for p in self.stage.parameters])
         self.rounds: list[Iteration] = []
         self.rivals = self.values[None]
+        self.noise = float("nan")
         self._print = self._fingerprint()
 
     def _stage(self, terms: tuple[Term, ...]) -> Stage:
@@ -131,7 +147,7 @@ class _Loop:
 
     def _fingerprint(self) -> str:
         """Digest of all that decides which simulations are run; not of how long the loop goes on."""
-        settings = replace(self.settings, iterations=1, requirement=None)
+        settings = replace(self.settings, iterations=1, requirement=None, worthwhile=None)
         parameters = [(p.name, p.nominal, p.lower, p.upper) for p in self.stage.parameters]
         bounds = [self.space.lower.tolist(), self.space.upper.tolist(), self.space.start.tolist()]
         content = [__version__, self.model.fingerprint, parameters, bounds, repr(self.task), repr(settings), self.seed]
@@ -147,6 +163,10 @@ class _Loop:
             best = self.rounds[-1].best
             if self.settings.requirement is not None and best >= self.settings.requirement:
                 reason = f"The requirement is met: {best:.4g} m/s on the robot after {len(self.book.made)} trials."
+                break
+            promise = self.rounds[-1].promise
+            if self._not_worthwhile(promise):
+                reason = f"Another trial is worth {promise:.2g} m/s, less than {self.settings.worthwhile:.2g}."
                 break
             away = disengaged(self.rounds)
             if away:
@@ -170,17 +190,16 @@ class _Loop:
         )
 
     def _round(self, number: int) -> Iteration:
-        found, journal = self._search_controllers(number)
-        pool = pool_of(journal.records, self.book.known)
-        for row in self._choose(pool):
-            self.book.add(self.robot, number, pool.controllers[row], float(pool.expected[row]))
+        drawn = None if self.settings.draws == 1 else self._imagine(number)
+        found, journal = self._search_controllers(number, drawn)
+        promise = self._try(number, pool_of(journal.records, self.book.known), drawn)
         tried = self.book.of(number)
         last = journal.records[-1].arrays["loss"] if journal.records else np.full(1, np.nan)
         transfer = _mean([abs(t.expected - t.trial.fitness) for t in tried if t.trial.outcome != "crashed"])
         joined, before = "", self.values
         names = tuple(p.name for p in self.stage.parameters)
         problem = self._model_problem(self._remembered(), before)
-        searched = self._search_model(number, problem)
+        searched = self._search_model(number, problem) if self.settings.learn else None
         if searched is not None and self.settings.close and self._stuck(problem, searched[1]):
             stage = self.stage
             joined = self._close(number, before)
@@ -189,21 +208,82 @@ class _Loop:
                 if problem.distance == LIKELIHOOD and self.stage is not stage:
                     self._search_model(number, problem, "models_again")
         report = self._report(number, found, last, tried, transfer, problem, searched, joined)
-        return replace(report, population_names=names)
+        self.noise = report.noise
+        return replace(report, population_names=names, promise=promise)
 
-    def _search_controllers(self, number: int) -> tuple[FitResult, Journal]:
+    def _imagine(self, number: int) -> Imagination:
+        """Models drawn from what is believed after the iterations before."""
+        others, unmeasured = Belief.unmeasured(self.model, self.terms)
+        belief = Belief.before(self.terms).towards(self.values, self.noise).beside(unmeasured)
+        count = ASSESSED * self.settings.draws
+        drawn = belief.draws(np.random.default_rng([self.seed, number, STEPS["models_drawn"]]), count)
+        return Imagination(self._stage((*self.terms, *others)), np.vstack([belief.mean, drawn[1:]]))
+
+    def _search_controllers(self, number: int, drawn: Imagination | None) -> tuple[FitResult, Journal]:
         """Step 1."""
+        estimator = self.settings.first if number == 1 else self.settings.controllers
+        if drawn is not None:
+            region, models = Region.after(self.book.made, self.space), drawn.models[: self.settings.draws]
+            start = self.space.start if region.centre is None else region.centre
+            robust = RobustProblem(drawn.stage, models, start, region.lower, region.upper, self.settings.risk)
+            return self._search(number, "controllers", estimator, robust)
         best = self.book.best
         start = self.space.start if best is None else best.controller.values
         correction = linear_correction(self.stage, self.values, self.book.made) if self.settings.correct else None
         problem = ControllerProblem(self.stage, self.values, start, correction)
-        estimator = self.settings.first if number == 1 else self.settings.controllers
         return self._search(number, "controllers", estimator, problem)
 
-    def _choose(self, pool: Pool) -> list[int]:
-        """Step 2."""
-        choose = get_choice(self.settings.choice)
-        return choose(pool, self.settings.trials, lambda some: self.stage.fitness(some, self.rivals))
+    def _try(self, number: int, pool: Pool, drawn: Imagination | None) -> float | None:
+        """Step 2: try controllers, each chosen by all that was tried before; what the first promised, m/s."""
+        choose, count = get_choice(self.settings.choice), self.settings.trials
+        disagreeing: dict[bytes, FloatArray] = {}
+
+        def rivals(some: FloatArray) -> FloatArray:
+            key = some.tobytes()
+            if key not in disagreeing:
+                disagreeing[key] = self.stage.fitness(some, self.rivals)
+            return disagreeing[key]
+
+        look = None
+        if drawn is not None:
+            pool = drawn.shortlist(pool, SHORTLIST * count)
+            look = self._outlook(number, pool, drawn)
+        taken: list[int] = []
+        promise: float | None = None
+        while len(taken) < count:
+            made = self.book.made
+            best = max((t.trial.fitness for t in made if t.trial.outcome == "done"), default=0.0)
+            foresight = None if look is None else look.foresee(made)
+            near = None if look is None else Region.after(made, self.space).contains(pool.controllers)
+            row = choose(Offer(pool, rivals, foresight, near, best), taken, count)
+            if row is None:
+                break
+            if foresight is not None and promise is None:
+                promise = float(foresight.improvement(best)[row])
+                if self._not_worthwhile(promise):
+                    break
+            taken.append(row)
+            foreseen = None if foresight is None else foresight.of(row)
+            expected = float(pool.expected[row]) if foreseen is None else foreseen.fitness
+            tried = self.book.add(self.robot, number, pool.controllers[row], expected, foreseen)
+            if foreseen is not None:
+                self.say(_told(tried, foreseen))
+        return promise
+
+    def _not_worthwhile(self, promise: float | None) -> bool:
+        least = self.settings.worthwhile
+        return least is not None and promise is not None and promise < least and bool(self.book.made)
+
+    def _outlook(self, number: int, pool: Pool, drawn: Imagination) -> Outlook:
+        """What controllers of a pool, and all that were tried, do in drawn models; kept in a journal."""
+        before = [t.controller.values for t in self.book.made][-REMEMBERED:]
+        controllers = np.reshape([*before, *pool.controllers], (-1, len(self.space.names)))
+        label = f"{number:02d}_{STEPS['outlook']}_outlook"
+        path = None if self.folder is None else self.folder / "journals" / f"{label}.jsonl"
+        journal = Journal(path, fingerprint=f"{self._print}/{label}")
+        self.simulations += len(controllers) * len(drawn.models)
+        asked = np.arange(len(before), len(controllers))
+        return Outlook(controllers, drawn.outcomes(controllers, journal), asked)
 
     def _remembered(self) -> list[Tried]:
         """Trials that Step 3 explains: half of them the newest, the others from all before, evenly."""
@@ -343,6 +423,9 @@ def disengaged(rounds: Sequence[Iteration]) -> str:
         return f"Disengaged: the last {PATIENCE} iterations found no controller that had not been tried before."
     if len(tried) < 2 * PATIENCE or np.ptp(real) == 0:
         return ""
+    held = [t.foreseen.low <= t.trial.fitness <= t.foreseen.high for t in tried if t.foreseen is not None]
+    if held and np.mean(held) >= HELD:
+        return ""
     correlation = _rank_correlation(expected, real)
     if correlation > UNCORRELATED:
         return ""
@@ -386,6 +469,14 @@ def _mean(values: FloatArray | list[float]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
 
+def _told(t: Tried, foreseen: Foreseen) -> str:
+    ended = {"done": "stood", "fallen": "fell", "crashed": "crashed"}[t.trial.outcome]
+    return (
+        f"trial {t.controller.label}: foreseen {foreseen.fitness:.3g} m/s ({foreseen.low:.2g} to {foreseen.high:.2g}; "
+        f"falls with {probability(1 - foreseen.stands)}); {t.trial.fitness:.3g} m/s, {ended}"
+    )
+
+
 def _line(r: Iteration) -> str:
     fell = sum(t.trial.outcome != "done" for t in r.tried)
     parts = [
@@ -394,4 +485,6 @@ def _line(r: Iteration) -> str:
         f"expected {r.expected:.4g}",
         f"fitness differs by {r.transfer:.2g} before, {r.delta:.2g} after correction of the model",
     ]
+    if r.promise is not None:
+        parts.append(f"a trial promised {r.promise:.2g} m/s")
     return ", ".join(parts) + (f"; {r.joined}" if r.joined else "")

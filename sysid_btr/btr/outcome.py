@@ -43,6 +43,8 @@ class Iteration:
     noise : position error of this model in noise floors on them; NaN where nothing was logged.
     best : largest real fitness so far.
     joined : what `close` said, if it ran.
+    promise : what the first trial was worth beforehand, m/s: the gain to be expected, times the chance to stand; None
+        where one model chose. Nothing is tried where that is less than is worthwhile.
     """
 
     number: int
@@ -62,6 +64,7 @@ class Iteration:
     noise: float
     best: float
     joined: str = ""
+    promise: float | None = None
     population_names: tuple[str, ...] = ()
 
 
@@ -138,6 +141,8 @@ class BackToReality:
                     "trials": self.settings.trials,
                     "distance": self.settings.distance,
                     "choice": self.settings.choice,
+                    "draws": self.settings.draws,
+                    "risk": asdict(self.settings.risk),
                     "memory": self.settings.memory,
                     "controllers": repr(self.settings.controllers),
                     "models": repr(self.settings.models),
@@ -232,7 +237,22 @@ def _message(outcome: BackToReality) -> str:
         f"{best.trial.fitness:.4g} m/s on the robot (trial {best.controller.label}; {started:.4g} in the first "
         f"iteration) after {len(outcome.tried)} trials{f', {fell} of which fell or crashed' if fell else ''}; the "
         f"model predicts fitness within {outcome.iterations[-1].transfer:.2g} m/s, {first.transfer:.2g} at first. "
-        f"{outcome.reason}"
+        f"{_foreseen(outcome)}{outcome.reason}"
+    )
+
+
+def _foreseen(outcome: BackToReality) -> str:
+    """How what was foreseen came out, in words."""
+    told = [(t, t.foreseen) for t in outcome.tried if t.foreseen is not None]
+    if not told:
+        return ""
+    held = sum(f.low <= t.trial.fitness <= f.high for t, f in told)
+    falls, fell = sum(1 - f.stands for _, f in told), sum(t.trial.outcome != "done" for t, _ in told)
+    last = outcome.iterations[-1].promise
+    worth = "" if last is None else f" The last iteration's trials promised {last:.2g} m/s."
+    return (
+        f"Of {len(told)} trials {held} lay in their 90 % interval; {falls:.1f} falls were foreseen, {fell} happened."
+        f"{worth} "
     )
 
 
@@ -254,6 +274,7 @@ def _iteration(i: Iteration) -> dict[str, Any]:
         "model": dict(zip(i.names, i.model, strict=True)),
         "models": {"names": i.population_names, "values": i.population, "losses": i.losses},
         "closing": i.joined or None,
+        "promise": i.promise,
     }
 
 
@@ -265,4 +286,5 @@ def _tried(t: Tried) -> dict[str, Any]:
         "fitness": t.trial.fitness,
         "outcome": t.trial.outcome,
         "controller": t.controller.values,
+        "foreseen": None if t.foreseen is None else asdict(t.foreseen),
     }

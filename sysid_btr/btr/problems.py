@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.robot import Trial
 from sysid_btr.btr.task import Walk
@@ -47,16 +47,24 @@ class Stage:
         return self.world.spread(self.space.joints, self.space.commands(controllers, self.task.time))
 
     def fitness(self, controllers: FloatArray, models: FloatArray) -> FloatArray:
-        """Fitness (k, m) of controllers (m, p) in models (k, q), all in as few batches as memory allows."""
+        """Fitness (k, m) of controllers (m, p) in models (k, q); NaN where the simulation diverged."""
+        return self.outcomes(controllers, models)[0]
+
+    def outcomes(self, controllers: FloatArray, models: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Fitness and whether they fell, (k, m) each, of controllers (m, p) in models (k, q).
+
+        All in as few batches as memory allows. What diverged has no fitness (NaN), and fell.
+        """
         k, m = len(models), len(controllers)
         commands = self.commands(controllers)
         which, model = np.tile(np.arange(m), k), np.repeat(np.arange(k), m)
-        result = np.empty(k * m)
+        fitness, fell = np.empty(k * m), np.empty(k * m, dtype=bool)
         for rows in _blocks(k * m):
             for part, outputs in self.world.run(commands[which[rows]], models[model[rows]]):
                 assert outputs.base is not None
-                result[rows][part] = self.task.fitness(outputs.base)
-        return result.reshape(k, m)
+                fitness[rows][part] = self.task.fitness(outputs.base)
+                fell[rows][part] = self.task.fallen(outputs.base)[:, -1]
+        return fitness.reshape(k, m), fell.reshape(k, m) | np.isnan(fitness).reshape(k, m)
 
 
 def _blocks(count: int, size: int = 256) -> list[slice]:

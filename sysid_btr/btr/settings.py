@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from sysid_btr.btr.choice import get_choice
 from sysid_btr.btr.problems import FITNESS
+from sysid_btr.btr.robust import Risk
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Estimator
 from sysid_btr.estimators.chain import needs_residuals
@@ -63,12 +64,17 @@ class Settings:
     models : Step 3; least squares needs a likelihood.
     distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse`` or ``wasserstein`` of whole trials, or the
         ``likelihood`` of their first seconds, biased by the last model.
-    choice : of trials, ``fittest`` or ``disagreement``.
+    choice : of trials, ``fittest``, ``disagreement`` or ``improvement``.
+    draws : models that Step 1 runs controllers in, drawn from what is believed, the ground's softness and friction and
+        late commands among it; 1 is the believed model alone, as in the paper.
+    risk : how falls and the worst of these models count.
+    worthwhile : m/s that another trial must promise for the loop to go on; None goes on.
     memory : trials that Step 3 explains, the newest first; those before are taken evenly.
     rivals : candidate models that may disagree.
     requirement : real fitness with which the work is done.
     close : look for missing effects where Step 3 cannot explain the robot's logs.
     correct : leave the model as it is and correct its fitness linearly instead (a baseline).
+    learn : let Step 3 correct the model; without, trials count in what is foreseen alone.
     """
 
     iterations: int = 13
@@ -78,17 +84,25 @@ class Settings:
     models: Estimator = field(default_factory=model_search)
     distance: str = FITNESS
     choice: str = "fittest"
+    draws: int = 1
+    risk: Risk = field(default_factory=Risk)
+    worthwhile: float | None = None
     memory: int = 12
     rivals: int = 5
     requirement: float | None = None
     close: bool = False
     correct: bool = False
+    learn: bool = True
 
     def __post_init__(self) -> None:
-        if min(self.iterations, self.trials, self.memory, self.rivals) < 1:
-            raise UsageError("btr: iterations, trials, memory and rivals must be at least 1")
-        if self.close and self.correct:
-            raise UsageError("btr: with a linear correction the model stays as it is; nothing can be added to it")
+        if min(self.iterations, self.trials, self.memory, self.rivals, self.draws) < 1:
+            raise UsageError("btr: iterations, trials, memory, rivals and draws must be at least 1")
+        if self.draws == 1 and (self.choice == "improvement" or self.worthwhile is not None):
+            raise UsageError("btr: what another trial promises is seen in drawn models: take at least 2 draws")
+        if self.draws > 1 and self.correct:
+            raise UsageError("btr: the linear correction is of one model's fitness; take 1 draw")
+        if self.close and (self.correct or not self.learn):
+            raise UsageError("btr: the model stays as it is (a linear correction, or no Step 3); nothing can be added")
         if needs_residuals(self.models) and self.distance != LIKELIHOOD:
             raise UsageError(f"btr: least squares minimises a likelihood; give --distance {LIKELIHOOD}, or cmaes or ga")
         get_choice(self.choice)

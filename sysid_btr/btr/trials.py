@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.controllers import Controller
+from sysid_btr.btr.foresight import Foreseen
 from sysid_btr.btr.robot import OUTCOMES, Robot, Trial
 from sysid_btr.errors import UsageError
 from sysid_btr.io.parquet import read_log, write_log
@@ -30,12 +31,14 @@ class Tried:
     controller : as it was played.
     expected : its fitness in the model that chose it.
     trial : on the robot.
+    foreseen : of it, before; None where one model chose.
     """
 
     iteration: int
     controller: Controller
     expected: float
     trial: Trial
+    foreseen: Foreseen | None = None
 
 
 @dataclass(eq=False)
@@ -65,7 +68,9 @@ class TrialBook:
         """The trials of one iteration."""
         return [t for t in self.made if t.iteration == iteration]
 
-    def add(self, robot: Robot, iteration: int, values: FloatArray, expected: float) -> Tried:
+    def add(
+        self, robot: Robot, iteration: int, values: FloatArray, expected: float, foreseen: Foreseen | None = None
+    ) -> Tried:
         """Try a controller, or read what came of it when it was tried before this run was stopped.
 
         Raises
@@ -78,7 +83,7 @@ class TrialBook:
         if trial is None:
             trial = robot.run(controller)
             self._write(controller, iteration, expected, trial)
-        tried = Tried(iteration, controller, expected, trial)
+        tried = Tried(iteration, controller, expected, trial, foreseen)
         self.made.append(tried)
         return tried
 

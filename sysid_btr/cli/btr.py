@@ -32,6 +32,8 @@ DURATIONS, LONG = {"ant": 3.0}, 8.0
 """s of a trial by robot, and of any other."""
 LONGEST = 3600.0
 """s of a trial."""
+DRAWS = 8
+"""Models that controllers are searched in."""
 BY_FITNESS, BY_SENSORS = 12, 2
 """Trials of an iteration where models are judged by fitness, and where by sensors (the paper's m)."""
 
@@ -78,7 +80,25 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     choice: str = option(
-        "fittest", "How trials are chosen: fittest, or disagreement (among models).", metavar="NAME", decides=True
+        "fittest",
+        "How trials are chosen: fittest, disagreement (among models), or improvement (times the chance to stand).",
+        metavar="NAME",
+        decides=True,
+    )
+    draws: int | None = option(
+        None,
+        "Number of models in which controllers are searched for, drawn from what is believed; 1 is the model alone.",
+        otherwise="8 for the choice improvement, else 1",
+        metavar="N",
+        least=1,
+        decides=True,
+    )
+    risk: float = option(
+        0.5, "Weight of the worst quarter of these models beside their mean, 0 to 1.", metavar="WEIGHT", decides=True
+    )
+    fall_cost: float = option(0.1, "What a fall costs in the search for controllers.", metavar="M/S", decides=True)
+    worthwhile: float | None = option(
+        None, "Stop once another trial promises less than this.", metavar="M/S", decides=False
     )
     search: str = option(
         "ga", "How controllers are searched for: ga (the paper) or cmaes.", metavar="NAME", decides=True
@@ -148,6 +168,7 @@ def btr(options: BtrOptions) -> int:
 def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
     """How the loop searches."""
     from sysid_btr.btr.map_problem import model_fit
+    from sysid_btr.btr.robust import Risk
     from sysid_btr.btr.settings import (
         LIKELIHOOD,
         Settings,
@@ -172,6 +193,9 @@ def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
         models=models[search],
         distance=options.distance,
         choice=options.choice,
+        draws=options.draws or (DRAWS if options.choice == "improvement" else 1),
+        risk=Risk(weight=options.risk, fall=options.fall_cost),
+        worthwhile=options.worthwhile,
         memory=max(trials, 4),
         requirement=options.requirement,
         close=options.close,

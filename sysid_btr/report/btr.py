@@ -65,6 +65,9 @@ def _fitness(axis: Axes, result: Mapping[str, Any]) -> None:
     x = [r["number"] for r in rounds]
     at = [t["iteration"] for t in result["trials"]]
     axis.scatter(at, _numbers([t["fitness"] for t in result["trials"]]), s=8, color=faint(), label="trials")
+    for t in result["trials"]:
+        if t.get("foreseen"):
+            axis.plot([t["iteration"]] * 2, [t["foreseen"]["low"], t["foreseen"]["high"]], color=faint(), lw=0.5)
     for key, label, colour, line in (
         ("best", "best on the robot", FOUND, "-"),
         ("mean", "mean on the robot", FOUND, ":"),
