@@ -17,6 +17,7 @@ from html import escape
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import pdoc
 from pdoc.render_helpers import to_html
@@ -33,6 +34,7 @@ TITLES = {
     "robot_and_log": "Your robot and your log",
     "verdicts": "What each verdict means",
     "effects": "Effects",
+    "result": "result.json",
     "machines": "Many machines",
     "limits": "Limits",
     "architecture": "How it is built",
@@ -129,6 +131,51 @@ def effects_page() -> str:
     return "\n".join(lines) + "\n"
 
 
+def result_page() -> str:
+    """Every name in result.json, as its schema describes it."""
+    from sysid_btr.result import result_schema
+
+    schema = result_schema()
+    lines = [
+        "# result.json",
+        "",
+        f"{schema['description']} The same as a JSON schema: `sysid_btr.result.result_schema()`. As pandas tables: "
+        '`sb.tables("out")`, whose names are those of the lists here, with `errors`, `joints` and `run` for the rest.',
+        "",
+        *_names(schema),
+    ]
+    for name, entry in schema["$defs"].items():
+        if entry.get("properties"):
+            lines += ["", f"## {name}", "", *_names(entry)]
+    return "\n".join(lines) + "\n"
+
+
+def _names(entry: dict[str, Any]) -> list[str]:
+    """A table of the properties of an object."""
+    rows = [f"| `{name}` | {_kind(e)} | {e.get('description', '')} |" for name, e in entry["properties"].items()]
+    return ["| name | type | meaning |", "|---|---|---|", *rows]
+
+
+def _kind(entry: dict[str, Any]) -> str:
+    """The type of a value in words; what has a table of its own by its name."""
+    if "$ref" in entry:
+        return f"[{entry['$ref'].rpartition('/')[2]}](#{entry['$ref'].rpartition('/')[2]})"
+    if "const" in entry:
+        return f'"{entry["const"]}"'
+    if "enum" in entry:
+        return ", ".join(f'"{value}"' for value in entry["enum"])
+    if "anyOf" in entry:
+        return " or ".join(_kind(one) for one in entry["anyOf"])
+    kind = entry.get("type", "any")
+    if kind == "array":
+        return f"list of {_kind(entry['items'])}"
+    if kind == "object" and isinstance(entry.get("additionalProperties"), dict):
+        return f"by name: {_kind(entry['additionalProperties'])}"
+    if kind == "object" and entry.get("properties"):
+        return "object of " + ", ".join(f"`{name}`" for name in entry["properties"])
+    return " or ".join(kind) if isinstance(kind, list) else str(kind)
+
+
 def commands_page() -> str:
     """Every verb with its help, as the command line prints it."""
     import typer
@@ -192,7 +239,12 @@ def first_line(documented: object) -> str:
     return " ".join((documented.__doc__ or "").strip().partition("\n\n")[0].split()).replace("|", "\\|")
 
 
-PAGES: dict[str, Callable[[], str]] = {"effects": effects_page, "commands": commands_page, "reference": reference_page}
+PAGES: dict[str, Callable[[], str]] = {
+    "effects": effects_page,
+    "result": result_page,
+    "commands": commands_page,
+    "reference": reference_page,
+}
 
 
 def broken_links(out: Path) -> Iterator[str]:

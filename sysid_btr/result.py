@@ -11,6 +11,7 @@ import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,13 @@ from sysid_btr.reading import parse_json
 from sysid_btr.version import __version__
 
 SCHEMA = "sysid_btr.result/1"
+
+
+def result_schema() -> dict[str, Any]:
+    """The JSON schema of result.json (draft 2020-12): every name it may hold, with what it means."""
+    text = files("sysid_btr").joinpath("result.schema.json").read_text(encoding="utf-8")
+    schema: dict[str, Any] = json.loads(text)
+    return schema
 
 
 def versions() -> dict[str, str]:

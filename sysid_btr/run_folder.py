@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import secrets
 import socket
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 from weakref import finalize
 
 from sysid_btr.errors import UsageError
@@ -81,6 +82,28 @@ def _is_there(path: Path, file: IO[str]) -> bool:
 def _free(path: Path, file: IO[str]) -> None:
     path.unlink(missing_ok=True)
     file.close()
+
+
+def relative(path: str | Path, folder: Path) -> str:
+    """A path as seen from a folder, with slashes, so that both can be moved together; as it is on another drive."""
+    try:
+        return Path(os.path.relpath(Path(path).resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return str(path)
+
+
+def make_relative(content: dict[str, Any], folder: Path) -> None:
+    """Make the paths of logs and model in a result, or in params.json, relative to the folder it is written to."""
+    for entry in _with_paths(content):
+        if entry.get("path") is not None:
+            entry["path"] = relative(entry["path"], folder)
+
+
+def _with_paths(content: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for name in ("logs", "walks", "episodes"):
+        yield from content.get(name, ())
+    if "model" in content:
+        yield content["model"]
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from terminal import Answer, Cli
 
 from sysid_btr.cli import run
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.result import result_schema
+from sysid_btr.run_folder import RESULT, Folder
 
 GOOD_JOINTS = ("HeadYaw", "LKneePitch", "RKneePitch", "LHipRoll", "RHipRoll")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def results_follow_their_schema() -> Iterator[None]:
+    """Every result.json that a test has written is what its schema says."""
+    validator = jsonschema.Draft202012Validator(result_schema())
+    write = Folder.write
+
+    def checked(self: Folder, name: str, content: str | bytes) -> Path:
+        if name == RESULT:
+            validator.validate(json.loads(content))
+        return write(self, name, content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Folder, "write", checked)
+        yield
 
 
 @pytest.fixture(scope="session")

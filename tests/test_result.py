@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,7 +21,7 @@ from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.report.html import Picture, render
-from sysid_btr.result import clean, exit_code, read_result, to_json
+from sysid_btr.result import clean, exit_code, read_result, result_schema, to_json
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.model import Model
 from sysid_btr.units import si, si_all, with_digits_of
@@ -139,6 +140,22 @@ def test_every_promised_key_is_there(study: Study) -> None:
     assert {"effect", "family", "where", "parameters", "certainty", "otherwise", "explains"} <= set(effect)
     assert {"provisional", "gain_holdout", "evidence"} <= set(effect)
     assert set(effect["parameters"][0]) == set(parameter)
+
+
+def test_a_result_is_what_its_schema_says_and_nothing_else(study: Study) -> None:
+    schema = result_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    result = closing(study).to_dict(seed=4)
+    jsonschema.validate(result, schema)
+    for wrong in ({**result, "chi2": 1.0}, {**result, "verdict": "perhaps"}, {**result, "covariance": None}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(wrong, schema)
+    undocumented = [
+        name
+        for name, entry in schema["properties"].items()
+        if not {"description", "const", "enum", "$ref"} & set(entry)
+    ]
+    assert undocumented == []
 
 
 def test_round_trip(study: Study, tmp_path: Path) -> None:

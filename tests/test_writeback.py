@@ -329,6 +329,18 @@ def test_an_include_that_changes_is_put_in_place(tmp_path: Path, out: Folder) ->
     assert not unlike(mujoco.MjSpec.from_file(str(path)), made)
 
 
+def test_what_is_written_can_be_moved_together_with_the_model(tmp_path: Path) -> None:
+    own = write_own(tmp_path / "here" / "mine")
+    out = tmp_path / "here" / "runs" / "out"
+    out.mkdir(parents=True)
+    assert save_model(Folder(out), draft(declared(own, ["kp:ankle"], [1.25])))["reproduces"]
+    (tmp_path / "here").rename(tmp_path / "there")
+    written = tmp_path / "there" / "runs" / "out" / "model.xml"
+    assert str(tmp_path) not in written.read_text()
+    assert "../../mine/" in written.read_text()
+    assert mujoco.MjModel.from_xml_path(str(written)).nmesh == 1
+
+
 def test_nested_includes_and_textures_are_found_from_elsewhere(tmp_path: Path, out: Folder) -> None:
     rest = REST.replace(
         "<!-- included -->", '<include file="parts/deep.xml"/><asset><texture name="t" type="2d" file="t.png"/></asset>'
@@ -761,6 +773,10 @@ def pendulum_flags() -> list[str]:
 def test_a_run_leaves_model_and_parameters(finished: Path) -> None:
     result = json.loads((finished / "result.json").read_text())
     assert result["written"]["path"] == "model.xml"
+    params = json.loads((finished / "params.json").read_text())
+    for path in (result["model"]["path"], params["model"]["path"], result["logs"][0]["path"]):
+        assert not Path(path).is_absolute()
+        assert (finished / path).is_file()
     assert result["written"]["reproduces"]
     assert result["written"]["sha256"] == hashlib.sha256((finished / "model.xml").read_bytes()).hexdigest()
     assert any(c["attribute"] == "frictionloss" for c in result["changes"])

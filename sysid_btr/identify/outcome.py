@@ -191,6 +191,7 @@ def _facts(study: Study, mount: str) -> list[dict[str, Any]]:
 def _logs(study: Study) -> list[dict[str, Any]]:
     from sysid_btr.io.parquet import sha256
 
+    dates = {e.log.path: e.recording.recorded for e in (*study.train, *study.holdout)}
     fitted = {episode.log.path for episode in study.train}
     held = {episode.log.path for episode in study.holdout}
     entries = []
@@ -201,6 +202,7 @@ def _logs(study: Study) -> list[dict[str, Any]]:
                 "path": None if path is None else str(path),
                 "sha256": None if path is None else sha256(path),
                 "used_for": parts,
+                "recorded": dates[path],
             }
         )
     return entries

@@ -6,6 +6,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
@@ -223,6 +224,7 @@ def parse_meta(raw: Mapping[str, Any], problems: list[Problem]) -> LogMeta:
         accept(key, isinstance(raw.get(key), str), "text")
     accept("mount", raw.get("mount") in ("fixed", "free"), '"fixed" (the torso was fixed) or "free"')
     accept("command_hold", raw.get("command_hold") in ("zoh", "linear"), '"zoh" or "linear"')
+    accept("recorded", _is_date(raw.get("recorded")), 'ISO 8601, e.g. "2026-11-23T14:05:00+00:00"')
     period, servo = raw.get("sample_period"), raw.get("servo_period")
     accept("sample_period", period is None or _positive(period), "a positive number of seconds")
     quick, slow = SERVO_PERIODS
@@ -276,6 +278,14 @@ def _misspelled_keys(extra: Iterable[str], raw: Mapping[str, Any]) -> Iterator[P
                 f"the schema has no key `{key}`, so it is kept but not used; did you mean `{guess}`?",
                 f"rename it to `{guess}` if so",
             )
+
+
+def _is_date(value: object) -> bool:
+    """Whether it is a date, or a date and time, in ISO 8601."""
+    try:
+        return isinstance(value, str) and bool(datetime.fromisoformat(value))
+    except ValueError:
+        return False
 
 
 def _numbers(value: object) -> bool:

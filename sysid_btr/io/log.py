@@ -6,6 +6,7 @@ import difflib
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 T = TypeVar("T")
+
+SINCE_1970 = (9e8, 9e9)
+"""s; a clock whose origin is between these, in the years 1998 to 2255, counts from 1970."""
 
 ATTRIBUTE = "sysid_btr"
 """Key of the metadata in a DataFrame's ``attrs``, as in a file."""
@@ -87,6 +91,8 @@ class LogMeta:
     noise : mapping of str to float
         Standard deviation of a sensor's noise, SI, by channel or by column, where it is known; else it is read from the
         log.
+    recorded : str
+        When it was recorded, ISO 8601, e.g. ``"2026-11-23T14:05:00+00:00"``.
     notes : str
         Free text.
     extra : mapping
@@ -106,6 +112,7 @@ class LogMeta:
     torque_constant: float | Mapping[str, float] | None = None
     at: Mapping[str, float] | str = ""
     noise: Mapping[str, float] = field(default_factory=dict)
+    recorded: str = ""
     notes: str = ""
     extra: Mapping[str, Any] = field(default_factory=dict)
 
@@ -244,6 +251,15 @@ class Log:
         for kind in dict.fromkeys(name.partition(".")[0] for name in self.channels):
             facts[kind] = ", ".join(self.joints(kind))
         return facts
+
+    @property
+    def recorded(self) -> str | None:
+        """When it began, ISO 8601: as the metadata say, or of a clock that counts from 1970; None if neither."""
+        if self.meta.recorded:
+            return self.meta.recorded
+        if len(self) and SINCE_1970[0] < self.time[0] < SINCE_1970[1]:
+            return datetime.fromtimestamp(float(self.time[0]), UTC).isoformat(timespec="seconds")
+        return None
 
     @property
     def _seconds(self) -> float:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from sysid_btr.errors import UsageError
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.style import on_page
-from sysid_btr.run_folder import OVERLAY, REPORT, RESULT, Folder
+from sysid_btr.run_folder import OVERLAY, REPORT, RESULT, Folder, make_relative
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -139,7 +139,8 @@ def _profile(profile: Profile) -> Figure:
 def write_pages(folder: Folder, result: dict[str, Any], pictures: Iterable[tuple[str, Draw]]) -> Path:
     """Write result.json, then pictures and report; a picture that cannot be drawn costs no more than itself.
 
-    The result is written before anything is drawn, and again with the names of the pictures.
+    The result is written before anything is drawn, and again with the names of the pictures. Paths in it become
+    relative to the folder.
 
     Returns
     -------
@@ -148,6 +149,7 @@ def write_pages(folder: Folder, result: dict[str, Any], pictures: Iterable[tuple
     """
     from sysid_btr.result import to_json
 
+    make_relative(result, folder.path)
     folder.write(RESULT, to_json(result))
     names, failed = _keep(folder, pictures)
     result["pictures"] = names

@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sysid_btr.run_folder import relative
 from sysid_btr.writeback.xmltext import (
     Edit,
     Element,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 LONG_NUMBER = re.compile(r"-?\d+\.\d{10,}(?:e[-+]?\d+)?")
 DIGITS = 17
 """Significant digits from which every float64 reads back."""
+FOLDERS = ("meshdir", "texturedir", "assetdir")
 TEXTURE_FILES = ("file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
 
 
@@ -86,7 +88,7 @@ def own_source(path: Path) -> Source:
         raise ValueError(f"{path} is not MJCF")
     found: list[Included] = []
     text = _expand(text, path.parent, path.parent, found)
-    return Source(absolute_assets(text, path.parent.resolve()), str(path), tuple(found))
+    return Source(absolute_assets(text, path.parent.resolve()), path.name, tuple(found))
 
 
 def made_source(robot: Robot, why: str = "") -> Source:
@@ -95,7 +97,7 @@ def made_source(robot: Robot, why: str = "") -> Source:
     spec.compile()
     text = LONG_NUMBER.sub(lambda m: number(float(m[0])), precise_xml(spec)).encode()
     folder = Path(spec.modelfiledir or ".").resolve()
-    origin = f"the robot {robot.name}" if robot.path is None else str(robot.path)
+    origin = f"the robot {robot.name}" if robot.path is None else robot.path.name
     return Source(absolute_assets(text, folder), origin + why, own=False)
 
 
@@ -168,6 +170,23 @@ def absolute_assets(text: bytes, folder: Path) -> bytes:
     elif missing:
         inserted.append(append_child(text, root, [element_text("compiler", missing)], first=True))
     return apply(text, [*inserted, *(set_attributes(text, e, values) for e, values in edits.values())])
+
+
+def relative_assets(text: bytes, folder: Path) -> bytes:
+    """Make folders of meshes and textures and included files relative to the folder in which the text will stand.
+
+    Parameters
+    ----------
+    text : MJCF, with absolute paths as `absolute_assets` and `fold_includes` leave them.
+    folder : where it will stand.
+    """
+    edits = []
+    for element in parse(text).walk():
+        names = {"compiler": FOLDERS, "include": ("file",), "model": ("file",)}.get(element.tag, ())
+        given = {n: element.attributes[n] for n in names if Path(element.attributes.get(n, "")).is_absolute()}
+        if given:
+            edits.append(set_attributes(text, element, {n: relative(path, folder) for n, path in given.items()}))
+    return apply(text, edits)
 
 
 def _relative_file(element: Element) -> bool:

@@ -16,7 +16,7 @@ from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.result import clean, to_json
-from sysid_btr.run_folder import MODEL, PARAMS, Folder
+from sysid_btr.run_folder import MODEL, PARAMS, Folder, make_relative
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
 from sysid_btr.version import __version__
@@ -26,7 +26,7 @@ from sysid_btr.writeback.filed import loss_of, of_file, stands_alone
 from sysid_btr.writeback.native import Part
 from sysid_btr.writeback.params import PARAMS_SCHEMA
 from sysid_btr.writeback.rewrite import CannotWriteError, Compiled, compile_text, rewrite
-from sysid_btr.writeback.source import Source, fold_includes, made_source, own_source
+from sysid_btr.writeback.source import Source, fold_includes, made_source, own_source, relative_assets
 from sysid_btr.writeback.target import Target, make_parts, make_target
 from sysid_btr.writeback.xmltext import parse
 
@@ -242,11 +242,11 @@ def save_model(folder: Folder, made: Draft) -> dict[str, Any]:
         file, with the loss that leaving it out alone would cost.
     """
     name = MODEL if not _is_own(folder.path / MODEL, made.robot) else OTHER
-    path = folder.write(name, made.text())
+    path = folder.write(name, relative_assets(made.text(), folder.path))
     reported, (own, alone) = reported_losses(made.identified), file_losses(made.identified, path)
     missing = [_missing(part, made.identified) for part in made.missing]
     if missing or not own.close_to(reported):
-        path = folder.write(name, made.text(_costs(own, reported)))
+        path = folder.write(name, relative_assets(made.text(_costs(own, reported)), folder.path))
     return {
         "path": path.name,
         "sha256": sha256(path.read_bytes()).hexdigest(),
@@ -281,7 +281,9 @@ def describe_model(outcome: Fit | Closing, result: dict[str, Any], folder: Folde
     try:
         model = identified(outcome)
         if folder is not None:
-            folder.write(PARAMS, to_json(params_of(model)))
+            params = params_of(model)
+            make_relative(params, folder.path)
+            folder.write(PARAMS, to_json(params))
         made = draft(model)
         result["changes"] = [clean(asdict(change)) for change in made.changes]
         if folder is not None:
