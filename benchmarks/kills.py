@@ -4,7 +4,7 @@ A command is killed (SIGKILL) at a moment that is drawn between its start and it
 --resume where the verb has it, else with --overwrite. What it then writes must be what it writes undisturbed, to the
 bit, but for the time it took. A disk is full where no file may grow beyond some size, drawn too: the command must end
 with 2 and one message. Of two that write to one place at the same time one works, and the other is refused or writes
-the same.
+the same. What a verb prints and does not write is kept in a file by the shell.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 OUT = Path(__file__).parent / "results" / "kills.json"
 MODEL, LOG = str(SAMPLES / "pendulum.xml"), str(SAMPLES / "pendulum_friction.parquet")
 STUDY = ("-m", MODEL, "-l", LOG, "-f", "mass:*", "-f", "kp:*", "--threads", "1")
+WALK = ("--robot-sim", "ant", "--robot-set", "mass:*=1.1", "--iterations", "2", "--trials", "2", "--duration", "1")
+PRINTED = "printed"
+"""File for what a command prints to stdout."""
 TIMED = ("wall_s",)
 """What a result says of the time it took."""
 
@@ -63,6 +66,11 @@ COMMANDS = {
     "import": Command(("import", LOG, "-o", "out.parquet"), "out.parquet"),
     "init": Command(("init", LOG, "-m", MODEL, "-o", "out.toml"), "out.toml"),
     "report": Command(("report", "out"), "out/report.html", "", ("fit", *STUDY, "-o", "out")),
+    "btr": Command(
+        ("btr", "-m", "ant", *WALK, "-f", "mass:Trunk", "--threads", "1", "-o", "out"), "out/result.json", "--resume"
+    ),
+    "validate": Command(("validate", LOG, "-m", MODEL, "--json"), PRINTED, ""),
+    "demo": Command(("demo", "--threads", "1", "-o", "out"), "out/leg/result.json", ""),
 }
 
 
@@ -159,9 +167,10 @@ def with_another(command: Command, whole: Whole) -> str:
     """What is wrong after two at the same place at the same time."""
     with TemporaryDirectory() as folder:
         _prepare(command, folder)
-        pipe = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-        both = [subprocess.Popen(_words(command.words), cwd=folder, **pipe) for _ in range(2)]  # type: ignore[call-overload]
-        said = [process.communicate()[1] for process in both]
+        pipe: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        both = [subprocess.Popen(_words(command.words), cwd=folder, **pipe) for _ in range(2)]
+        printed, said = zip(*(process.communicate() for process in both), strict=True)
+        Path(folder, PRINTED).write_text(printed[0])
         codes = [process.returncode for process in both]
         if not set(codes) <= {0, 2, 5} or set(codes) == {2}:
             return f"two writers: exits {codes}: {said}"
@@ -185,7 +194,9 @@ def _words(words: Sequence[str]) -> list[str]:
 
 
 def _run(words: Sequence[str], folder: str, before: Any = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(_words(words), cwd=folder, capture_output=True, text=True, check=False, preexec_fn=before)
+    done = subprocess.run(_words(words), cwd=folder, capture_output=True, text=True, check=False, preexec_fn=before)
+    Path(folder, PRINTED).write_text(done.stdout)
+    return done
 
 
 def _content(path: Path) -> Any:
