@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from toys import robot_from_xml, swing
 
+from sysid_btr.display.text import curve_lines, tabled_estimates
+from sysid_btr.identify.curves import curves_of
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import make_study
-from sysid_btr.report.curves import curves_of, plot_curves
+from sysid_btr.report.curves import plot_curves
 from sysid_btr.report.figures import figure_of
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
@@ -185,12 +187,47 @@ def test_a_report_draws_the_curve_with_its_interval_at_every_point() -> None:
         for p, v in zip(term.parameters, values, strict=True)
     ]
     (curve,) = curves_of(Model.of([term], values), known)
-    np.testing.assert_allclose(curve.torque, term.curve("knee", values, curve.x))
+    np.testing.assert_allclose(curve.value, term.curve("knee", values, curve.x))
     size = 1.96 * 0.01 * np.sqrt(np.sum(term.modes_of("knee", curve.x) ** 2, axis=1))
-    np.testing.assert_allclose(curve.high - curve.torque, size)
+    np.testing.assert_allclose(curve.high - curve.value, size)
     axes = plot_curves([curve])
     assert axes[0, 0].get_xlabel() == "time (s)"
     assert figure_of(axes) is not None
+
+
+def test_numbers_that_err_together_make_a_curve_as_uncertain_as_their_sum() -> None:
+    """A constant and a slope that err against each other: known where they cancel, doubly unknown where they add."""
+    term = at_knee(FreeTorqueTime)
+    rows = np.eye(8)
+    rows[0, 1] = rows[1, 0] = -1.0
+    known = [
+        Estimate(
+            p.name, p.unit, 0.0, 0.0, 0.01 * (i < 2), (0.0, 0.0), (p.lower, p.upper), "yes", False, "", None, tuple(row)
+        )
+        for i, (p, row) in enumerate(zip(term.parameters, rows, strict=True))
+    ]
+    (curve,) = curves_of(Model.of([term], np.zeros(8)), known)
+    first, second = term.modes_of("knee", curve.x)[:, :2].T
+    np.testing.assert_allclose(curve.high, 1.96 * 0.01 * np.abs(first - second), atol=1e-12)
+    assert curve.parameters == tuple(p.name for p in term.parameters)
+    assert curves_of(Model.of([term], np.zeros(8)), ()) == ()
+
+
+def test_numbers_of_a_curve_are_a_line_of_a_result_and_no_rows_of_its_table() -> None:
+    term = at_knee(FreeTorqueTime)
+    values = np.array([0.2, 0.1, *[0.0] * 6])
+    names = [p.name for p in term.parameters]
+    known = [
+        Estimate(name, "Nm", 0.0, 0.0, 0.01, (0.0, 0.0), (-1.0, 1.0), "yes", at_bound=False, reason="")
+        for name in ("mass:shank", *names)
+    ]
+    result = {
+        "parameters": [e.to_dict() for e in known],
+        "curves": [c.to_dict() for c in curves_of(Model.of([term], values), known)],
+    }
+    assert [p["name"] for p in tabled_estimates(result)] == ["mass:shank"]
+    (line,) = curve_lines(result)
+    assert line.startswith("knee: torque that changes slowly with time: ")
 
 
 def test_position_of_the_toy_is_finite_under_every_form() -> None:

@@ -74,7 +74,8 @@ def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]
         yield Text(f"  {certainty_words(effect)}")
         if effect["confused_with"]:
             yield Text(f"  confounded on this log with: {', '.join(effect['confused_with'])}")
-    estimates = estimates_of(result)
+    yield from (Text(line) for line in curve_lines(result))
+    estimates = tabled_estimates(result)
     if estimates:
         yield parameters_table(estimates)
         yield from map(Text, exactness(result))
@@ -200,6 +201,19 @@ def parameters_table(parameters: Sequence[Mapping[str, Any]]) -> Table:
 def estimates_of(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """All parameters of a result: the declared ones, then those of its effects."""
     return [*result.get("parameters", []), *(p for e in result.get("effects", []) for p in e["parameters"])]
+
+
+def curve_lines(result: Mapping[str, Any]) -> Iterator[str]:
+    """What was learnt, where it goes and how well it is known."""
+    for curve in result.get("curves", []):
+        half = median(0.5 * (high - low) for low, high in zip(curve["low"], curve["high"], strict=True))
+        yield f"{curve['title']}: {curve['words']}; the 95 % interval at each value is +- {number(half, 2)} (median)"
+
+
+def tabled_estimates(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The same without the numbers of curves, which say something together alone."""
+    together = {name for curve in result.get("curves", []) for name in curve["parameters"]}
+    return [p for p in estimates_of(result) if p["name"] not in together]
 
 
 def exactness(result: Mapping[str, Any]) -> Iterator[str]:

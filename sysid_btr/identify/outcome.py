@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
+from sysid_btr.identify.curves import curves_of
 from sysid_btr.identify.intervals import Estimate, correlation_matrix, covariance_matrix
 from sysid_btr.identify.residuals import residuals
 from sysid_btr.identify.scores import ChannelScore, Scores
@@ -76,8 +77,12 @@ class StudyOutcome:
         wall_s : wall time to record, s; default that of all of it.
         """
         wall_s = self.seconds if wall_s is None else wall_s
-        matrices = {"covariance": self.covariance, "correlation": self.correlation}
-        return study_result(self.study, {**self.found, **matrices}, seed=seed, replays=self.replays, wall_s=wall_s)
+        more = {
+            "covariance": self.covariance,
+            "correlation": self.correlation,
+            "curves": [curve.to_dict() for curve in curves_of(self.model, self.estimates)],
+        }
+        return study_result(self.study, {**self.found, **more}, seed=seed, replays=self.replays, wall_s=wall_s)
 
     @property
     def correlation(self) -> FloatArray:

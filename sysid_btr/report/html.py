@@ -16,11 +16,11 @@ from sysid_btr.display.text import (
     channel_scores,
     compact,
     episode_words,
-    estimates_of,
     exactness,
     identifiability,
     number,
     stages,
+    tabled_estimates,
 )
 from sysid_btr.units import si, si_all, with_digits_of
 
@@ -73,7 +73,7 @@ def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         rows=list(_error_rows(result)),
         floors=any(floor is not None for floor in result.get("noise_floor", {}).values()),
         bars=_bars(result),
-        estimates=estimates_of(result),
+        estimates=tabled_estimates(result),
         intervals=_intervals(result),
         pictures=[(p, _data_uri(p.light), None if p.dark is None else _data_uri(p.dark)) for p in shown],
         left_out=left_out,

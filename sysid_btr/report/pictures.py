@@ -103,9 +103,10 @@ CAPTIONS: Mapping[str, Caption] = {
 
 def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]]:
     """Names of an outcome's pictures and what draws them, in the order of the report."""
+    from sysid_btr.identify.curves import curves_of
     from sysid_btr.identify.fit import Fit
     from sysid_btr.posterior.outcome import Posterior
-    from sysid_btr.report.curves import curves_of, plot_curves
+    from sysid_btr.report.curves import plot_curves
     from sysid_btr.report.figures import figure_of, plot_convergence, plot_overlay, plot_residuals, trace_outcome
     from sysid_btr.writeback.write import identified
 
