@@ -396,6 +396,48 @@ def test_killed_in_any_step_it_goes_on_to_the_same_end(where: str, tmp_path: Pat
     assert again.count == 0
 
 
+IMPROVING = replace(TINY, choice="improvement", draws=2)
+
+
+@pytest.fixture(scope="module")
+def improved() -> BackToReality:
+    """A tiny run whose trials are chosen one after the other."""
+    return tiny(hidden(), settings=IMPROVING)
+
+
+@pytest.mark.parametrize("dies_in", [2, 3])
+def test_a_run_that_improves_goes_on_to_the_same_end(dies_in: int, tmp_path: Path, improved: BackToReality) -> None:
+    with pytest.raises(Killed):
+        tiny(Counting(hidden(), dies_in), tmp_path, IMPROVING)
+    second = Counting(hidden())
+    assert same(tiny(second, tmp_path, IMPROVING), improved)
+    assert dies_in - 1 + second.count == len(improved.tried)
+
+
+def test_what_was_foreseen_is_said_beside_what_happened(improved: BackToReality) -> None:
+    said: list[str] = []
+    tiny(hidden(), settings=replace(IMPROVING, iterations=1), say=said.append)
+    result = json.loads(to_json(improved.to_dict()))
+    for trial, line in zip(result["trials"][:2], said, strict=False):
+        foreseen = trial["foreseen"]
+        assert foreseen["low"] < foreseen["fitness"] < foreseen["high"]
+        assert 0 < foreseen["stands"] < 1
+        assert line.startswith(f"trial {trial['trial']}: foreseen")
+        assert line.endswith(f"{trial['fitness']:.3g} m/s, stood")
+    held = sum(t["foreseen"]["low"] <= t["fitness"] <= t["foreseen"]["high"] for t in result["trials"])
+    assert f"Of 4 trials {held} lay in their 90 % interval" in result["message"]
+    assert all(i["promise"] >= 0 for i in result["iterations"])
+
+
+def test_the_loop_ends_before_a_trial_that_promises_too_little() -> None:
+    outcome = tiny(hidden(), settings=replace(IMPROVING, worthwhile=1e3))
+    assert len(outcome.tried) == 2
+    assert outcome.finished
+    assert "Another trial is worth" in outcome.reason
+    with pytest.raises(UsageError, match="2 draws"):
+        replace(TINY, worthwhile=0.1)
+
+
 def test_more_iterations_go_on_from_where_fewer_ended(tmp_path: Path, whole: BackToReality) -> None:
     tiny(hidden(), tmp_path, replace(TINY, iterations=1))
     counting = Counting(hidden())
