@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from sysid_btr.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sysid_btr.comparing import compare
     from sysid_btr.diagnosis.close import close
     from sysid_btr.executors import open_executor
     from sysid_btr.identify.fit import fit
@@ -34,6 +35,7 @@ _HOME = {
     "Log": "sysid_btr.io.log",
     "LogMeta": "sysid_btr.io.log",
     "close": "sysid_btr.diagnosis.close",
+    "compare": "sysid_btr.comparing",
     "fit": "sysid_btr.identify.fit",
     "import_log": "sysid_btr.importing",
     "load_robot": "sysid_btr.models.builtin",
@@ -54,6 +56,7 @@ __all__ = [
     "Log",
     "LogMeta",
     "close",
+    "compare",
     "fit",
     "import_log",
     "load_robot",

@@ -14,6 +14,7 @@ import typer
 
 from sysid_btr.cli.btr import btr
 from sysid_btr.cli.close import close
+from sysid_btr.cli.compare import compare
 from sysid_btr.cli.demo import demo
 from sysid_btr.cli.excite import excite
 from sysid_btr.cli.fit import fit
@@ -51,6 +52,7 @@ VERBS: tuple[Callable[[Any], int], ...] = (
     close,
     btr,
     excite,
+    compare,
     report,
     demo,
 )
