@@ -16,6 +16,7 @@ from sysid_btr.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from sysid_btr.comparing import compare
+    from sysid_btr.deploying import model, ranges, sample
     from sysid_btr.diagnosis.close import close
     from sysid_btr.executors import open_executor
     from sysid_btr.identify.fit import fit
@@ -40,11 +41,14 @@ _HOME = {
     "import_log": "sysid_btr.importing",
     "load_robot": "sysid_btr.models.builtin",
     "make_study": "sysid_btr.identify.study",
+    "model": "sysid_btr.deploying",
     "open_executor": "sysid_btr.executors",
     "posterior": "sysid_btr.posterior",
+    "ranges": "sysid_btr.deploying",
     "read_log": "sysid_btr.io.parquet",
     "read_result": "sysid_btr.result",
     "replay_log": "sysid_btr.identify.replay",
+    "sample": "sysid_btr.deploying",
     "save": "sysid_btr.saving",
     "tables": "sysid_btr.saving",
     "validate_file": "sysid_btr.io.validation",
@@ -61,11 +65,14 @@ __all__ = [
     "import_log",
     "load_robot",
     "make_study",
+    "model",
     "open_executor",
     "posterior",
+    "ranges",
     "read_log",
     "read_result",
     "replay_log",
+    "sample",
     "save",
     "tables",
     "validate_file",
