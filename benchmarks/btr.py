@@ -62,7 +62,7 @@ class Plan:
     iterations: int = 4
     trials: int = 4
     draws: int = 6
-    generations: int = 3
+    generations: int = 5
 
     @property
     def count(self) -> int:

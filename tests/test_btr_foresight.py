@@ -10,6 +10,7 @@ import pytest
 from sysid_btr.btr.choice import Offer, Pool, improvement
 from sysid_btr.btr.controllers import Controller, ControllerSpace
 from sysid_btr.btr.foresight import Drawn, Foresight, foresee
+from sysid_btr.btr.outlook import Cloud, log_weights
 from sysid_btr.btr.robot import Trial
 from sysid_btr.btr.robust import Risk, RobustProblem
 from sysid_btr.btr.trials import Tried
@@ -75,7 +76,7 @@ def test_what_stands_everywhere_is_worth_more_than_what_is_faster_and_falls_some
     fell[3, 0] = True
     assert np.argmax(Risk().worth(fitness, fell)) == 1
     assert np.argmax(Risk(weight=0.0, fall=0.0).worth(fitness, fell)) == 0
-    np.testing.assert_allclose(Risk(weight=0.0).worth(fitness, fell), [(7 * 0.06 - 0.1) / 8, 0.04])
+    np.testing.assert_allclose(Risk(weight=0.0, fall=0.1).worth(fitness, fell), [(7 * 0.06 - 0.1) / 8, 0.04])
     assert np.isnan(Risk().worth(np.full((2, 1), np.nan), np.ones((2, 1), dtype=bool))).all()
     with pytest.raises(UsageError, match="share"):
         Risk(share=0.0)
@@ -109,6 +110,29 @@ def test_the_search_gives_most_runs_to_the_best_and_none_of_the_others_passes_th
     assert np.sum(loss <= loss[best]) == 1
     alone = RobustProblem(table, np.arange(8.0)[:, None], np.zeros(1), *bounds, Risk())  # type: ignore[arg-type]
     assert alone.loss(np.array([[float(best)]]))[0] == pytest.approx(-whole[best])
+
+
+def test_models_that_do_as_the_robot_did_count_and_others_still_do() -> None:
+    drawn, own, stands = world(3, models=48)
+    likest = drawn.beside(Drawn(np.zeros((0, 3)), np.zeros((48, 0)), np.zeros((48, 0), dtype=bool)))
+    likest.fitness[17], likest.fell[17] = own, ~stands
+    seen = np.arange(12)
+    tried, real, stood = likest.of(seen), own[seen], stands[seen]
+    weights = log_weights(tried, real, stood)
+    assert np.argmax(weights) == 17
+    share = np.exp(weights)
+    assert share.sum() ** 2 / (share @ share) >= 12
+    trials = [
+        Tried(1, Controller(c), 0.0, Trial(None, float(f), "done" if s else "fallen"))
+        for c, f, s in zip(tried.controllers, real, stood, strict=True)
+    ]
+    cloud = Cloud(None, trials, tried)  # type: ignore[arg-type]
+    rows = [cloud.pick(8, np.random.default_rng(seed)) for seed in range(40)]
+    assert all(len(set(r.tolist())) == 8 for r in rows)
+    assert all(np.all(np.diff(weights[r]) <= 0) for r in rows)
+    assert np.mean([17 in r for r in rows]) > 2 * 8 / 48
+    untried = log_weights(tried.of(np.arange(0)), np.zeros(0), np.zeros(0, dtype=bool))
+    np.testing.assert_array_equal(untried, np.zeros(48))
 
 
 def offer(mean: list[float], stands: list[float], near: list[bool]) -> Offer:

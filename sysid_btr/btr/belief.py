@@ -13,13 +13,13 @@ from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
-UNMEASURED: Mapping[str, float] = {"foot_compliance": 1.0, "foot_friction": 0.2, "command_delay": 0.02}
+UNMEASURED: Mapping[str, float] = {"foot_compliance": 0.5, "foot_friction": 0.2, "command_delay": 0.02}
 """What no trial measures by itself, or nobody declares: effect -> standard deviation about its neutral value.
 
 A ground is as soft as nobody knows; grass, carpet and tiles under rubber differ by tens of percent in friction; a bus
 and a servo's own cycle take a few periods of 10 to 20 ms.
 """
-WIDTH = 3.0
+WIDTH = 2.0
 """Standard deviation of a parameter before anything is known, in changes that matter (`Parameter.scale`)."""
 
 ACCEPTED = 3.0

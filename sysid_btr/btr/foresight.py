@@ -46,6 +46,18 @@ class Drawn:
     fitness: FloatArray
     fell: BoolArray
 
+    def beside(self, other: Drawn) -> Drawn:
+        """These controllers and others, in the same models."""
+        return Drawn(
+            np.concatenate([self.controllers, other.controllers]),
+            np.concatenate([self.fitness, other.fitness], axis=1),
+            np.concatenate([self.fell, other.fell], axis=1),
+        )
+
+    def models(self, rows: IntArray) -> Drawn:
+        """All of them in some of the models."""
+        return Drawn(self.controllers, self.fitness[rows], self.fell[rows])
+
     def of(self, rows: IntArray) -> Drawn:
         """Some of them."""
         return Drawn(self.controllers[rows], self.fitness[:, rows], self.fell[:, rows])
@@ -115,11 +127,7 @@ def foresee(drawn: Drawn, tried: Drawn, real: FloatArray, stood: BoolArray) -> F
     tried : those that were tried on the robot, in the same models, (t,).
     real, stood : (t,) their fitness there, and whether they stood; of one that fell only that counts.
     """
-    everything = Drawn(
-        np.concatenate([tried.controllers, drawn.controllers]),
-        np.concatenate([tried.fitness, drawn.fitness], axis=1),
-        np.concatenate([tried.fell, drawn.fell], axis=1),
-    )
+    everything = tried.beside(drawn)
     t = len(real)
     seen, asked = np.flatnonzero(stood), np.arange(t, len(everything.controllers))
     mean, std = _speed(everything, seen, asked, real[stood])

@@ -16,7 +16,7 @@ from time import perf_counter
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.choice import Offer, Pool, get_choice, pool_of
 from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
@@ -26,7 +26,7 @@ from sysid_btr.btr.exchange import quiet
 from sysid_btr.btr.foresight import Foreseen
 from sysid_btr.btr.map_problem import MapProblem
 from sysid_btr.btr.outcome import BackToReality, Iteration
-from sysid_btr.btr.outlook import Imagination, Outlook
+from sysid_btr.btr.outlook import Cloud, Imagination, Outlook
 from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
 from sysid_btr.btr.robust import RobustProblem
@@ -61,8 +61,8 @@ SHORTLIST = 3
 ASSESSED = 2
 """Times as many drawn models as Step 1 has in which the fittest are looked at once more: chosen for what they do in the
 first few, they do it less well in others."""
-REMEMBERED = 24
-"""Trials, the newest, from which it is learnt by how much model and robot differ."""
+MANY = 6
+"""Times as many models are drawn as controllers are searched in; those that do as the robot did are chosen."""
 SPOILT = 1.5
 """Times the error of the fitness that the last model foresees of the trials, above which a model is not taken."""
 
@@ -134,7 +134,9 @@ class _Loop:
         self.values = np.array([p.nominal for p in self.stage.parameters])
         self.rounds: list[Iteration] = []
         self.rivals = self.values[None]
-        self.noise = float("nan")
+        self.belief = Belief.before(self.terms)
+        self.cloud: Cloud | None = None
+        self.picked: IntArray = np.arange(0)
         self._print = self._fingerprint()
 
     def _stage(self, terms: tuple[Term, ...]) -> Stage:
@@ -208,16 +210,22 @@ class _Loop:
                 if problem.distance == LIKELIHOOD and self.stage is not stage:
                     self._search_model(number, problem, "models_again")
         report = self._report(number, found, last, tried, transfer, problem, searched, joined)
-        self.noise = report.noise
+        if self.settings.learn:
+            self.belief = Belief.before(self.terms).towards(self.values, report.noise)
         return replace(report, population_names=names, promise=promise)
 
     def _imagine(self, number: int) -> Imagination:
-        """Models drawn from what is believed after the iterations before."""
+        """Models drawn from what is believed after the iterations before, and chosen by what was tried."""
         others, unmeasured = Belief.unmeasured(self.model, self.terms)
-        belief = Belief.before(self.terms).towards(self.values, self.noise).beside(unmeasured)
-        count = ASSESSED * self.settings.draws
-        drawn = belief.draws(np.random.default_rng([self.seed, number, STEPS["models_drawn"]]), count)
-        return Imagination(self._stage((*self.terms, *others)), np.vstack([belief.mean, drawn[1:]]))
+        rng = np.random.default_rng([self.seed, STEPS["models_drawn"]])
+        belief = self.belief.beside(unmeasured)
+        models = np.vstack([belief.mean, belief.draws(rng, MANY * self.settings.draws - 1)])
+        if self.cloud is None or not np.array_equal(models, self.cloud.drawn.models):
+            self.cloud = Cloud(Imagination(self._stage((*self.terms, *others)), models))
+        self.simulations += self.cloud.learn(self.book.made, self._journal(number, "models_drawn"))
+        rng = np.random.default_rng([self.seed, number, STEPS["models_drawn"]])
+        self.picked = self.cloud.pick(ASSESSED * self.settings.draws, rng)
+        return self.cloud.drawn.only(self.picked)
 
     def _search_controllers(self, number: int, drawn: Imagination | None) -> tuple[FitResult, Journal]:
         """Step 1."""
@@ -276,14 +284,14 @@ class _Loop:
 
     def _outlook(self, number: int, pool: Pool, drawn: Imagination) -> Outlook:
         """What controllers of a pool, and all that were tried, do in drawn models; kept in a journal."""
-        before = [t.controller.values for t in self.book.made][-REMEMBERED:]
+        assert self.cloud is not None
+        found = drawn.outcomes(pool.controllers, self._journal(number, "outlook"))
+        self.simulations += len(pool.controllers) * len(drawn.models)
+        before = [t.controller.values for t in self.cloud.tried]
+        if self.cloud.done is not None:
+            found = self.cloud.done.models(self.picked).beside(found)
         controllers = np.reshape([*before, *pool.controllers], (-1, len(self.space.names)))
-        label = f"{number:02d}_{STEPS['outlook']}_outlook"
-        path = None if self.folder is None else self.folder / "journals" / f"{label}.jsonl"
-        journal = Journal(path, fingerprint=f"{self._print}/{label}")
-        self.simulations += len(controllers) * len(drawn.models)
-        asked = np.arange(len(before), len(controllers))
-        return Outlook(controllers, drawn.outcomes(controllers, journal), asked)
+        return Outlook(controllers, found, np.arange(len(before), len(controllers)))
 
     def _remembered(self) -> list[Tried]:
         """Trials that Step 3 explains: half of them the newest, the others from all before, evenly."""
@@ -333,9 +341,7 @@ class _Loop:
     def _search(
         self, number: int, step: str, estimator: Estimator, problem: SearchProblem
     ) -> tuple[FitResult, Journal]:
-        label = f"{number:02d}_{STEPS[step]}_{step}"
-        path = None if self.folder is None else self.folder / "journals" / f"{label}.jsonl"
-        journal = Journal(path, fingerprint=f"{self._print}/{label}")
+        journal = self._journal(number, step)
         rng = np.random.default_rng([self.seed, number, STEPS[step]])
         noted = _noted(self.progress, f"iteration {number}, {step}")
         found = estimator.fit(problem, rng=rng, budget=Budget(), journal=journal, progress=noted)
@@ -343,6 +349,11 @@ class _Loop:
             raise InterruptedRun(f"interrupted in iteration {number}, {step}; finished work is kept")
         self.simulations += round(found.evaluations * problem.runs)
         return found, journal
+
+    def _journal(self, number: int, step: str) -> Journal:
+        label = f"{number:02d}_{STEPS[step]}_{step}"
+        path = None if self.folder is None else self.folder / "journals" / f"{label}.jsonl"
+        return Journal(path, fingerprint=f"{self._print}/{label}")
 
     def _stuck(self, problem: ModelProblem, journal: Journal) -> bool:
         """Whether the sensors say that something is missing, and Step 3 found hardly anything better.

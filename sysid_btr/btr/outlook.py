@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.btr.choice import Pool
 from sysid_btr.btr.foresight import Drawn, Foresight, foresee
 from sysid_btr.btr.problems import Stage
@@ -18,6 +18,12 @@ ASKED = "outcomes"
 """Kind of a journal's record."""
 APART = 0.01
 """Root mean square difference, fraction of the range, from which controllers are two."""
+OTHERWISE = 0.1
+"""Probability that the robot falls where the right model stands, or the other way round."""
+OFF = 0.2
+"""Standard deviation of real fitness about that of the right model, over the fitness of trials."""
+LEFT = 0.25
+"""Share of the models that must go on to count: a few trials do not single out one of many."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +54,10 @@ class Imagination:
             journal.append(record)
         return Drawn(self.unit(controllers), record.arrays["fitness"].T, record.arrays["fell"].T > 0)
 
+    def only(self, rows: IntArray) -> Imagination:
+        """Some of the models."""
+        return Imagination(self.stage, self.models[rows])
+
     def shortlist(self, pool: Pool, count: int) -> Pool:
         """So many of a pool, those worth most, none of which is nearly another one."""
         rows: list[int] = []
@@ -56,6 +66,72 @@ class Imagination:
             if len(rows) < count and all(np.sqrt(np.mean((unit[i] - unit[j]) ** 2)) > APART for j in rows):
                 rows.append(int(i))
         return Pool(pool.controllers[rows], pool.expected[rows])
+
+
+def log_weights(tried: Drawn, real: FloatArray, stood: BoolArray) -> FloatArray:
+    """How much the trials speak for each model, (k,), by fitness and falls (the paper's phi1 as a likelihood).
+
+    The models are samples of what was believed before (importance sampling); the weights are tempered so far that
+    enough of them count (Neal 2001, doi:10.1023/A:1008923215028).
+
+    Parameters
+    ----------
+    tried : what the controllers of trials do in the models, (k, t).
+    real, stood : (t,) what they did on the robot; of one that fell only that counts.
+    """
+    up = ~tried.fell & np.isfinite(tried.fitness)
+    evidence = np.sum(np.where(up == stood, np.log(1 - OTHERWISE), np.log(OTHERWISE)), axis=1)
+    scale = OFF * float(np.sqrt(np.mean(real[stood] ** 2))) if stood.any() else 0.0
+    if scale > 0:
+        both = up & stood
+        evidence = evidence - 0.5 * np.sum(np.where(both, (tried.fitness - real) / scale, 0.0) ** 2, axis=1)
+    evidence = evidence - evidence.max()
+    temper = 1.0
+    while _count(temper * evidence) < LEFT * len(evidence):
+        temper *= 0.9
+    return np.asarray(temper * evidence)
+
+
+def _count(evidence: FloatArray) -> float:
+    """Effective number of models with these logarithmic weights."""
+    weight = np.exp(evidence)
+    return float(weight.sum() ** 2 / (weight @ weight))
+
+
+@dataclass(eq=False)
+class Cloud:
+    """Many models drawn from what is believed, and what was tried on the robot in all of them.
+
+    Attributes
+    ----------
+    drawn : the models.
+    tried : trials whose controllers ran in them.
+    done : what these do there, (k, t).
+    """
+
+    drawn: Imagination
+    tried: list[Tried] = field(default_factory=list)
+    done: Drawn | None = None
+
+    def learn(self, made: Sequence[Tried], journal: Journal) -> int:
+        """Run the controllers of trials that are new; the number of simulations."""
+        new = made[len(self.tried) :]
+        if not new:
+            return 0
+        found = self.drawn.outcomes(np.array([t.controller.values for t in new]), journal)
+        self.done = found if self.done is None else self.done.beside(found)
+        self.tried.extend(new)
+        return len(new) * len(self.drawn.models)
+
+    def pick(self, count: int, rng: np.random.Generator) -> IntArray:
+        """So many of the models, by the weight that the trials give them; the likeliest first."""
+        if self.done is None:
+            return np.arange(count)
+        real = np.array([t.trial.fitness for t in self.tried])
+        weights = log_weights(self.done, real, np.array([t.trial.outcome == "done" for t in self.tried]))
+        # without replacement (Efraimidis and Spirakis 2006, doi:10.1016/j.ipl.2005.11.003)
+        rows = np.argsort(-(weights + rng.gumbel(size=len(weights))), kind="stable")[:count]
+        return np.asarray(rows[np.argsort(-weights[rows], kind="stable")])
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,9 +25,9 @@ class Risk:
     fall : what a fall costs, m/s.
     """
 
-    weight: float = 0.5
+    weight: float = 0.25
     share: float = 0.25
-    fall: float = 0.1
+    fall: float = 0.05
 
     def __post_init__(self) -> None:
         if not (0 <= self.weight <= 1 and 0 < self.share <= 1 and np.isfinite(self.fall)):

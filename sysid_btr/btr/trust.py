@@ -11,7 +11,7 @@ from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.trials import Tried
 
-FIRST, LEAST, MOST = 0.15, 0.02, 0.5
+FIRST, LEAST, MOST = 0.2, 0.02, 0.5
 """Half-widths of the region, fractions of the range of every number: at first, at least, at most."""
 GROWS, SHRINKS = 1.1, 0.6
 """By what it grows with a trial that stood, and shrinks after one that did not: it stays where one of six falls."""

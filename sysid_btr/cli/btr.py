@@ -94,9 +94,9 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     risk: float = option(
-        0.5, "Weight of the worst quarter of these models beside their mean, 0 to 1.", metavar="WEIGHT", decides=True
+        0.25, "Weight of the worst quarter of these models beside their mean, 0 to 1.", metavar="WEIGHT", decides=True
     )
-    fall_cost: float = option(0.1, "What a fall costs in the search for controllers.", metavar="M/S", decides=True)
+    fall_cost: float = option(0.05, "What a fall costs in the search for controllers.", metavar="M/S", decides=True)
     worthwhile: float | None = option(
         None, "Stop once another trial promises less than this.", metavar="M/S", decides=False
     )

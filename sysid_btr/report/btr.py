@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 COLUMNS = 3
 NAMED = 2
 """Places listed in a label; of more, their number."""
+BESIDE = 0.06
+"""Iterations by which trials of one stand beside each other."""
 SHOWN = 30
 """Models drawn of each iteration, best last and darkest."""
 
@@ -63,11 +65,11 @@ def _numbers(values: Sequence[float | None]) -> list[float]:
 def _fitness(axis: Axes, result: Mapping[str, Any]) -> None:
     rounds = result["iterations"]
     x = [r["number"] for r in rounds]
-    at = [t["iteration"] for t in result["trials"]]
+    at = _places(result["trials"])
     axis.scatter(at, _numbers([t["fitness"] for t in result["trials"]]), s=8, color=faint(), label="trials")
-    for t in result["trials"]:
+    for place, t in zip(at, result["trials"], strict=True):
         if t.get("foreseen"):
-            axis.plot([t["iteration"]] * 2, [t["foreseen"]["low"], t["foreseen"]["high"]], color=faint(), lw=0.5)
+            axis.plot([place] * 2, [t["foreseen"]["low"], t["foreseen"]["high"]], color=faint(), lw=0.5)
     for key, label, colour, line in (
         ("best", "best on the robot", FOUND, "-"),
         ("mean", "mean on the robot", FOUND, ":"),
@@ -76,6 +78,15 @@ def _fitness(axis: Axes, result: Mapping[str, Any]) -> None:
         axis.plot(x, _numbers([r["fitness"][key] for r in rounds]), line, color=colour, label=label)
     axis.set_ylabel(f"fitness ({result['units']['fitness']})")
     axis.legend(fontsize=7)
+
+
+def _places(trials: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Where trials stand: side by side in their iteration where their intervals would cover each other."""
+    rounds = [t["iteration"] for t in trials]
+    if not any(t.get("foreseen") for t in trials):
+        return rounds
+    order = [rounds[:i].count(number) for i, number in enumerate(rounds)]
+    return [n + BESIDE * (i - (rounds.count(n) - 1) / 2) for n, i in zip(rounds, order, strict=True)]
 
 
 def _difference(axis: Axes, rounds: Sequence[Mapping[str, Any]]) -> None:
