@@ -251,3 +251,30 @@ def test_a_warning_names_what_a_compiled_model_lacks(closed: Closing, monkeypatc
     monkeypatch.setitem(native.NATIVE, type(closed.model.terms[2]), lambda *_: (None, "no", "a law of every time step"))  # type: ignore[index]
     with pytest.warns(IncompleteModelWarning, match="coulomb_friction at pendulum: a law of every time step"):
         sb.model(closed)
+
+
+# --- for the user's own step -----------------------------------------------------------------------------------------
+
+
+def test_a_model_for_a_step_fits_best_in_it(tmp_path: Path) -> None:
+    log = sb.read_log(SAMPLES / "leg_friction.parquet").window(0, 400)
+    robot, coarse = load_robot(str(SAMPLES / "leg.xml")), Numerics.parse("implicitfast:0.01")
+    free = ["kp:*=shared", "kv:*=shared", "frictionloss:KneePitch"]
+    exact, own = (sb.fit(make_study(robot, [log], numerics=n, threads=1), free) for n in (None, coarse))
+    assert own.study.numerics == coarse
+    np.testing.assert_array_equal(own.numerics_shift, 0.0)
+    there = own.study.train_problem(own.model)
+    foreign, native = there.loss(np.stack([exact.values, own.values]))
+    assert native < 0.9 * foreign
+    written = save_model(Folder(tmp_path), draft(Identified(own.study, own.model, own.estimates, ())))
+    assert written["reproduces"]
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert (model.opt.timestep, model.opt.integrator) == (0.01, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    assert own.to_dict()["numerics"]["stated"] is True
+
+
+@pytest.mark.parametrize("text", ["implicitfast", "rk45:0.002", "RK4:2 ms", "Euler:0", "Euler:5"])
+def test_what_is_no_integrator_and_step_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"implicitfast:0\.002"):
+        Numerics.parse(text)
+    assert Numerics.parse("rk4:0.005") == Numerics("RK4", 0.005, stated=True)

@@ -96,6 +96,7 @@ class Run:
         from sysid_btr.identify.mode import Mode
         from sysid_btr.identify.study import make_study
         from sysid_btr.objectives.targets import FITTED
+        from sysid_btr.simulation.numerics import Numerics
 
         warn_of(self.robot, self.logs)
         return make_study(
@@ -103,6 +104,7 @@ class Run:
             self.logs,
             holdout=read_holdout(self.options.holdout, self.options),
             channels=self.options.channels or FITTED,
+            numerics=None if self.options.numerics is None else Numerics.parse(self.options.numerics),
             simulator=self.options.simulator,
             mode=Mode(self.options.mode, self.options.segments),
             threads=self.options.threads,

@@ -111,7 +111,22 @@ class ModeOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyOptions(ModelOptions, ReadingOptions, ParameterOptions, ParamsOptions, ModeOptions):
+class NumericsOptions(Options):
+    """In what the identified model is to be used."""
+
+    numerics: str | None = option(
+        None,
+        "Identify the model for this integrator and step, in which you will use it: implicitfast:0.002. Its parameters "
+        "then make up for the integrator's error, and model.xml moves as reported in your own simulation.",
+        otherwise="as exact as the log needs, RK4",
+        short="--for",
+        metavar="INTEGRATOR:STEP",
+        decides=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions(ModelOptions, ReadingOptions, ParameterOptions, ParamsOptions, ModeOptions, NumericsOptions):
     """What is fitted to what: shared by `fit`, `posterior` and `close`."""
 
     holdout: Holdout = option(

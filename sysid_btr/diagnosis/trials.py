@@ -42,7 +42,7 @@ def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection)
         found = refit(shorten(study, rules.refit_seconds), Model(terms, start), judged=study)
         spent += found.evaluations + len(starts)
         finer = study.numerics.halved()
-        given_up = not study.procedure.refines_step or finer.integrator == "Euler" or finer.timestep < rules.finest_step
+        given_up = not study.procedure.refines_step or finer.exact or finer.timestep < rules.finest_step
         if np.isfinite(found.holdout) or given_up:
             return Trial(hypothesis, replace(found, evaluations=spent))
         # a stiff spring on a light body can be too fast for the step

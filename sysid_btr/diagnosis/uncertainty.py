@@ -55,7 +55,7 @@ def with_intervals(state: State, rules: Selection) -> State:
         bare = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks)
         clear = np.array([e.identifiable != "no" for e in bare])
         worst = np.max(np.abs(shift[clear]) / np.maximum([e.std for e in bare], 1e-300)[clear], initial=0.0)
-        final = study.numerics.integrator == "Euler" or not study.procedure.refines_step
+        final = study.numerics.exact or not study.procedure.refines_step
         if final or worst <= SHIFT_TOLERATED or refinement == rules.refinements:
             break
         study = replace(study, numerics=study.numerics.halved())

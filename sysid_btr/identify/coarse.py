@@ -39,7 +39,7 @@ def realise_servo(study: Study, model: Model) -> Study:
 
     Held torque under a known velocity, or an Euler step a period, which is a velocity from differences.
     """
-    if study.numerics.integrator != "Euler":
+    if study.numerics.integrator != "Euler" or study.numerics.stated:
         return study
     held = held_numerics(study.robot, study.train[0].log, study.threads, study.numerics.simulator)
     if held is None:

@@ -173,6 +173,7 @@ def _provenance(study: Study) -> dict[str, Any]:
             "error_in_noise_floors": study.numerics_error,
             "chosen": str(study.numerics),
             **({} if simulator == MUJOCO else {"simulator": simulator}),
+            **({"stated": True} if study.numerics.stated else {}),
         },
         "channels": study.channels,
         **({"walks": walks} if walks else {}),

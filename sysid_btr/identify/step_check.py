@@ -72,7 +72,7 @@ def with_short_steps(
     spent = 0
     for _ in range(MAX_REFINEMENTS):
         shift = at.shift
-        if not study.procedure.refines_step or study.numerics.integrator == "Euler" or _short_enough(at, shift):
+        if not study.procedure.refines_step or study.numerics.exact or _short_enough(at, shift):
             break
         study = replace(study, numerics=study.numerics.halved())
         problem = study.train_problem(model.at(at.values))
@@ -100,10 +100,10 @@ def numerics_shift(
 ) -> FloatArray:
     """Change of the estimates, (p,), to first order, when the step is halved.
 
-    Zero for a digital servo, whose period is part of the model.
+    Zero where the step is part of the model.
     """
     numerics = problem.episodes[0].replay.numerics
-    if numerics.integrator == "Euler":
+    if numerics.exact:
         return np.zeros(len(values))
     fine = problem.with_numerics(numerics.halved()).residuals(values[None])[0]
     if not np.isfinite(fine).all():

@@ -208,7 +208,8 @@ def make_study(
     logs : recordings to fit; each episode is replayed by itself.
     holdout : the last fraction of each log, or other logs; `logs` themselves where nothing will be fitted.
     channels : channels to fit, of ``position``, ``velocity``, ``effort``.
-    numerics : integrator and step; None chooses by a convergence check on the log.
+    numerics : integrator and step; None chooses by a convergence check on the log. Stated ones, such as
+        ``Numerics.parse("implicitfast:0.002")``, are those in which the model is to be used: nothing refines them.
     simulator : what moves the model, by name; None is that of `numerics`, or the built-in one.
     mode : how the logs are compared with the model.
     threads : worker threads, 0 for all cores.

@@ -6,8 +6,15 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from sysid_btr.errors import UsageError
+
 MUJOCO = "mujoco"
 """Name of the built-in simulator."""
+
+USUAL = (("simulator", MUJOCO), ("stated", False))
+"""What files do not say."""
+LONGEST = 0.1
+"""s, of a step."""
 
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 """MuJoCo's."""
@@ -19,7 +26,8 @@ class Numerics:
 
     With `servo_period` (s, a multiple of the step) the servos compute their torque once a period and hold it;
     without, they act as MuJoCo's own do, at every evaluation of the dynamics. `simulator` is the name of what moves the
-    model, see `simulation.registry`.
+    model, see `simulation.registry`. `stated` numerics are those in which the model is to be used: they are part of it,
+    and nothing refines them.
 
     Raises
     ------
@@ -31,6 +39,7 @@ class Numerics:
     timestep: float
     servo_period: float | None = None
     simulator: str = MUJOCO
+    stated: bool = False
 
     def __post_init__(self) -> None:
         if self.simulator == MUJOCO and self.integrator not in INTEGRATORS:
@@ -39,12 +48,41 @@ class Numerics:
             if seconds is not None and not 0 < seconds < math.inf:
                 raise ValueError(f"a step of {seconds} s")
 
+    @classmethod
+    def parse(cls, text: str) -> Numerics:
+        """Stated numerics as ``INTEGRATOR:STEP``, such as ``implicitfast:0.002``.
+
+        Raises
+        ------
+        UsageError
+            If it is not that.
+        """
+        name, _, step = text.partition(":")
+        integrator = {known.casefold(): known for known in INTEGRATORS}.get(name.strip().casefold())
+        try:
+            seconds = float(step)
+        except ValueError:
+            seconds = math.nan
+        if integrator is None or not 0 < seconds <= LONGEST:
+            raise UsageError(
+                f"{text!r} is not an integrator and its step: give one of {', '.join(INTEGRATORS)} and seconds up to "
+                f"{LONGEST:g}, such as implicitfast:0.002"
+            )
+        return cls(integrator, seconds, stated=True)
+
+    @property
+    def exact(self) -> bool:
+        """Whether they are part of the model, so that half the step is no nearer to the truth: stated ones, and an
+        explicit Euler step a period, which is how a digital servo behaves.
+        """
+        return self.stated or self.integrator == "Euler"
+
     def halved(self) -> Numerics:
         return replace(self, timestep=self.timestep / 2)
 
     def to_dict(self) -> dict[str, Any]:
-        """As in files: the simulator where it is not the built-in one."""
-        return {name: value for name, value in asdict(self).items() if (name, value) != ("simulator", MUJOCO)}
+        """As in files: the simulator where it is not the built-in one, and whether they were stated where they were."""
+        return {name: value for name, value in asdict(self).items() if (name, value) not in USUAL}
 
     @property
     def held_steps(self) -> int:

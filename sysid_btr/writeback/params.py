@@ -67,9 +67,11 @@ def read_params(path: Path, robot: Robot) -> Params:
             term = _term(entry, places, problems, robot)
             if term is not None:
                 parts.append((term, [float(p["value"]) for p in entry["parameters"]]))
-        own = {"servo_period": None, "simulator": MUJOCO, **content["numerics"]}
+        own = {"servo_period": None, "simulator": MUJOCO, "stated": False, **content["numerics"]}
         period = None if own["servo_period"] is None else float(own["servo_period"])
-        numerics = Numerics(str(own["integrator"]), float(own["timestep"]), period, str(own["simulator"]))
+        numerics = Numerics(
+            str(own["integrator"]), float(own["timestep"]), period, str(own["simulator"]), bool(own["stated"])
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(
             f"--params {file} was changed and cannot be read: {error!r}; give one as it was written"
