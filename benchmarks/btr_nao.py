@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.btr_seeds import loop, study
 from benchmarks.paper_nao import V32
-from sysid_btr.btr.choice import get_choice, pool_of
+from sysid_btr.btr.choice import pool_of
 from sysid_btr.btr.controllers import Controller, NaoGait
 from sysid_btr.btr.map_problem import model_fit
 from sysid_btr.btr.outcome import BackToReality
@@ -164,8 +164,8 @@ def nominal_only(stage: Stage, robot: HiddenRobot, outcome: BackToReality, plan:
         if -found.loss > best_of_all:
             best_of_all, blind = -found.loss, found.x
         pool = pool_of(journal.records, book.known)
-        for row in get_choice("fittest")(pool, settings.trials, lambda some: np.zeros((1, len(some)))):
-            book.add(robot, number, pool.controllers[row], float(pool.expected[row]))
+        for controller, expected in zip(pool.controllers, pool.expected[: settings.trials], strict=False):
+            book.add(robot, number, controller, float(expected))
     assert book.best is not None
     transferred = robot.run(Controller(blind))
     return {

@@ -721,7 +721,7 @@ def test_a_recording_on_another_clock_is_read_on_the_tasks(tmp_path: Path) -> No
 
 COMMAND = (
     *("btr", "--model", "ant", "--fit", "length:LFFemur", "--robot-sim", "ant", "--robot-set", "length:LFFemur=1.2"),
-    *("--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1"),
+    *("--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1", "--draws", "2"),
 )
 
 
@@ -736,7 +736,9 @@ def test_the_verb_writes_result_figure_and_report(tmp_path: Path, capsys: pytest
     assert [t["iteration"] for t in result["trials"]] == [1]
     assert result["parameters"][0]["name"] == "length:LFFemur"
     assert (out / "overlay.png").stat().st_size > 10_000
-    assert "m/s on the robot" in (out / "report.html").read_text()
+    report = (out / "report.html").read_text()
+    assert "m/s on the robot" in report
+    assert "its 90 % interval with falls" in report
     assert (out / "trials" / "trial_0001.parquet").exists()
     assert run(["report", str(out)]) == 0
     assert run([*COMMAND, "--out", str(out)]) == 2

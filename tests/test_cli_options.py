@@ -44,6 +44,7 @@ DECIDES_NOTHING = {
     "resume",
     "threads",
     "wait",
+    "worthwhile",
 }
 """How long is searched, where, and what is made of the answer: a journal goes on under other ones."""
 EXAMPLES: dict[Any, tuple[Any, Any]] = {

@@ -39,7 +39,7 @@ RUNS = {
     "excite": (("excite", *PENDULUM, "--fit", "mass:arm", "--seconds", "3", "--max-evaluations", "5"), 0),
     "btr": (
         ("btr", "--model", "ant", "--fit", "length:LFFemur", "--robot-sim", "ant", "--robot-set", "length:LFFemur=1.2",
-         "--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1"),
+         "--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1", "--choice", "fittest"),
         0,
     ),
 }  # fmt: skip

@@ -80,8 +80,8 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     choice: str = option(
-        "fittest",
-        "How trials are chosen: fittest, disagreement (among models), or improvement (times the chance to stand).",
+        "improvement",
+        "How trials are chosen: improvement (expected, times the chance to stand), fittest (the paper), disagreement.",
         metavar="NAME",
         decides=True,
     )
