@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from sysid_btr.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sysid_btr.checking import check
     from sysid_btr.comparing import compare
     from sysid_btr.deploying import model, ranges, sample
     from sysid_btr.diagnosis.close import close
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Log": "sysid_btr.io.log",
     "LogMeta": "sysid_btr.io.log",
+    "check": "sysid_btr.checking",
     "close": "sysid_btr.diagnosis.close",
     "compare": "sysid_btr.comparing",
     "fit": "sysid_btr.identify.fit",
@@ -59,6 +61,7 @@ _HOME = {
 __all__ = [
     "Log",
     "LogMeta",
+    "check",
     "close",
     "compare",
     "fit",

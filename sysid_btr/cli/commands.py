@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn, get_type_hints
 import typer
 
 from sysid_btr.cli.btr import btr
+from sysid_btr.cli.check import check
 from sysid_btr.cli.close import close
 from sysid_btr.cli.compare import compare
 from sysid_btr.cli.demo import demo
@@ -40,12 +41,13 @@ OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCE
 """What the system says where something cannot be written."""
 UNREAD = 128 + 13
 """Exit code where nobody reads the output, as a shell has it of a process that SIGPIPE ended."""
-STUDIED = (validate, replay, fit, posterior, close, btr, excite)
+STUDIED = (validate, check, replay, fit, posterior, close, btr, excite)
 """Verbs that take a study file."""
 VERBS: tuple[Callable[[Any], int], ...] = (
     validate,
     import_,
     init,
+    check,
     replay,
     fit,
     posterior,

@@ -1,0 +1,134 @@
+"""``sysid-btr check``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sysid_btr.cli.close import declared
+from sysid_btr.cli.groups import JsonOptions, ModelOptions, ParameterOptions, ReadingOptions, ThreadOptions
+from sysid_btr.cli.inputs import as_stated, find_robot, read_logs, warn_of
+from sysid_btr.cli.kinds import Names
+from sysid_btr.cli.options import option
+from sysid_btr.cli.terminal import print_json
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from rich.console import RenderableType
+
+    from sysid_btr.checking import LogCheck
+
+SHOWN = 30
+"""Effects that are printed; --json has all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckOptions(ModelOptions, ReadingOptions, ParameterOptions, ThreadOptions, JsonOptions):
+    """Options of `check`."""
+
+    effects: Names = option(("all",), "Effects to ask for.", metavar="all|NAME[,NAME..]", decides=False)
+    odds: float = option(
+        99.0, "Odds for an effect against none, at which it is said to show.", metavar="N", decides=False
+    )
+    budget: float = option(60.0, "Seconds after which no further effects are tried.", metavar="SECONDS", decides=False)
+
+
+def check(options: CheckOptions) -> int:
+    """Say what a log can tell before anything is fitted: which parameters, which effects and from what size.
+
+    Also how each joint moves, which drives reach their limits, and which motion would tell more.
+    """
+    from sysid_btr.checking import check as check_logs
+    from sysid_btr.progress import ProgressLine
+
+    robot = find_robot(options, options.bounds)
+    logs = as_stated(read_logs(options.log), options)
+    warn_of(robot, logs)
+    with ProgressLine("check") as progress:
+        found = check_logs(
+            robot,
+            logs,
+            declared(robot, options.fit),
+            effects=options.effects,
+            odds=options.odds,
+            budget=options.budget,
+            threads=options.threads,
+            progress=progress,
+        )
+    if options.json:
+        print_json(found.to_dict())
+        return 0
+    from sysid_btr.display.text import console
+
+    out = console(sys.stdout)
+    for part in _parts(found):
+        out.print(part)
+    return 0
+
+
+def _parts(found: LogCheck) -> Iterator[RenderableType]:
+    from rich.text import Text
+
+    from sysid_btr.display.text import identifiability, number
+    from sysid_btr.units import si
+
+    yield Text(found.message, style="bold")
+    rows = [
+        (
+            j.joint,
+            si(j.span, j.unit),
+            si(j.velocity, f"{j.unit}/s"),
+            si(j.torque, "N" if j.unit == "m" else "Nm"),
+            f"{100 * j.saturated:.0f} %",
+            f"{100 * j.beyond:.0f} %",
+            "-" if j.floor is None else si(j.floor, j.unit),
+        )
+        for j in found.joints
+    ]
+    titles = ("joint", "moves by", "peak velocity", "peak torque", "at torque limit", "beyond range", "noise floor")
+    yield _grid(titles, rows)
+    parameters = [
+        (
+            p.name,
+            number(p.nominal),
+            number(p.std, 2) if p.identifiable != "no" else "-",
+            "x nominal" if p.unit == "1" else p.unit,
+            identifiability(p.to_dict()),
+        )
+        for p in found.parameters
+    ]
+    yield _grid(("parameter", "nominal", "expected std", "unit", "identifiable"), parameters)
+    yield from (Text(f"  {p.name}: {p.reason}") for p in found.parameters if p.reason)
+    shown = [e for e in found.effects if e.shows_from is not None]
+    table = [
+        (
+            f"{e.effect} at {e.where}",
+            f"{number(e.shows_from, 2)}{'' if e.unit == '1' else ' ' + e.unit}",
+            ", ".join(e.confounded_with),
+        )
+        for e in shown[:SHOWN]
+    ]
+    yield _grid((f"would show (odds {found.odds:g}:1)", "from", "confounded with"), table)
+    if len(shown) > SHOWN:
+        yield Text(f"  and {len(shown) - SHOWN} more (--json has all)")
+    hidden = sorted({e.effect for e in found.effects} - {e.effect for e in shown})
+    if hidden:
+        yield Text(f"would show nowhere: {', '.join(hidden)}")
+    if found.skipped:
+        yield Text(f"not tried for lack of time (--budget): {', '.join(found.skipped)}")
+    yield from (Text(f"-> {line}") for line in found.advice)
+    yield Text("expected for a model that is right otherwise; what it lacks makes everything less certain", style="dim")
+
+
+def _grid(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> RenderableType:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold")
+    for title in titles:
+        table.add_column(title, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table
