@@ -21,6 +21,7 @@ from sysid_btr.io.split import split_episodes
 from sysid_btr.models.commands import commanded
 from sysid_btr.models.log_checks import require_drives
 from sysid_btr.models.robot import Robot, joint_names
+from sysid_btr.models.ties import as_logged
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP
@@ -204,7 +205,7 @@ def make_study(
 
     Parameters
     ----------
-    robot : model.
+    robot : model; joints that it ties together and the logs show moving apart are not tied.
     logs : recordings to fit; each episode is replayed by itself.
     holdout : the last fraction of each log, or other logs; `logs` themselves where nothing will be fitted.
     channels : channels to fit, of ``position``, ``velocity``, ``effort``.
@@ -229,6 +230,7 @@ def make_study(
     say = partial(progress, done=0, total=None, best=float("inf"))
     say(note="reading the motion")
     require_drives(robot, logs)
+    robot = as_logged(robot, logs)
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
     recordings = [e for log in logs for e in split_episodes(log)]
     if isinstance(holdout, int | float):

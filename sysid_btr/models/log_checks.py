@@ -14,6 +14,7 @@ from sysid_btr.io.validation import validate_log as _of_content
 from sysid_btr.models.commands import FED_FORWARD, command_columns, commanded, driven_by_effort
 from sysid_btr.models.pose import standing
 from sysid_btr.models.robot import Robot, joint_names, joint_ranges
+from sysid_btr.models.ties import broken_ties
 from sysid_btr.terms.drives import Drive, crowded_joints, joint_drives, own_controls
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def check_log(robot: Robot, log: Log) -> tuple[Problem, ...]:
         controls=tuple(own_controls(robot.model)),
         at=standing(robot, log),
     )
-    return worst_first((*content, *command_problems(robot, log)))
+    return worst_first((*content, *command_problems(robot, log), *tie_problems(robot, log)))
 
 
 def validate_log(log: Log, robot: Robot | None = None) -> tuple[Problem, ...]:
@@ -70,6 +71,20 @@ def require_drives(robot: Robot, logs: Iterable[Log]) -> None:
     told = [explain(log.path or "the log", problems) for log, problems in found.items() if problems]
     if told:
         raise ModelError("\n".join(told))
+
+
+def tie_problems(robot: Robot, log: Log) -> tuple[Problem, ...]:
+    """Joints that the model ties together and that the log shows moving apart."""
+    return tuple(
+        Problem(
+            "joint.tied",
+            "warning",
+            ", ".join(tie.joints),
+            str(tie),
+            "check the joints' names and signs; if they are right, the model's equality is wrong for this robot",
+        )
+        for tie in broken_ties(robot, [log])
+    )
 
 
 def command_problems(robot: Robot, log: Log) -> tuple[Problem, ...]:
