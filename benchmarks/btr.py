@@ -6,7 +6,8 @@ three of these at once, another amount in every seed. Each method has the same n
 
 - `loop`: gaits searched in models drawn from what is believed, tried by expected improvement times the chance to stand;
 - `learning`: the same, and the model is corrected by the trials (Step 3);
-- `fittest`: the loop as it was before, one model corrected by the trials, the fittest gaits tried;
+- `fittest`: the paper's, one model corrected by the trials, the fittest gaits tried; `disagreement` those on which
+  candidate models disagree; `corrected` leaves the model and corrects its fitness linearly;
 - `nominal`: the fittest gaits of the nominal model, searched anew from the best on the robot; `blind` is its first;
 - `randomised`: one search over the models believed in before any trial, its best gaits tried in order;
 - `cmaes`: CMA-ES on the robot alone.
@@ -222,6 +223,8 @@ METHODS: Mapping[str, Callable[[DrakeRobot, int, Plan, Path], list[dict[str, Any
     "loop": in_the_loop({}),
     "learning": in_the_loop({"learn": True}),
     "fittest": in_the_loop({**ONE, "learn": True}),
+    "disagreement": in_the_loop({**ONE, "learn": True, "choice": "disagreement"}),
+    "corrected": in_the_loop({**ONE, "correct": True}),
     "nominal": in_the_loop(ONE),
     "randomised": randomised,
     "cmaes": cmaes,

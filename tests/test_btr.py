@@ -418,7 +418,8 @@ def test_what_was_foreseen_is_said_beside_what_happened(improved: BackToReality)
     said: list[str] = []
     tiny(hidden(), settings=replace(IMPROVING, iterations=1), say=said.append)
     result = json.loads(to_json(improved.to_dict()))
-    for trial, line in zip(result["trials"][:2], said, strict=False):
+    assert "models that differ in length, command_delay, foot_friction, foot_compliance" in said[0]
+    for trial, line in zip(result["trials"][:2], said[1:], strict=False):
         foreseen = trial["foreseen"]
         assert foreseen["low"] < foreseen["fitness"] < foreseen["high"]
         assert 0 < foreseen["stands"] < 1

@@ -222,6 +222,7 @@ class _Loop:
         models = np.vstack([belief.mean, belief.draws(rng, MANY * self.settings.draws - 1)])
         if self.cloud is None or not np.array_equal(models, self.cloud.drawn.models):
             self.cloud = Cloud(Imagination(self._stage((*self.terms, *others)), models))
+            self.say(_believed(self.cloud.drawn, self.settings))
         self.simulations += self.cloud.learn(self.book.made, self._journal(number, "models_drawn"))
         rng = np.random.default_rng([self.seed, number, STEPS["models_drawn"]])
         self.picked = self.cloud.pick(ASSESSED * self.settings.draws, rng)
@@ -478,6 +479,16 @@ def _noted(progress: Progress, where: str) -> Progress:
 
 def _mean(values: FloatArray | list[float]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _believed(drawn: Imagination, settings: Settings) -> str:
+    called = dict.fromkeys(p.name.partition(":")[0].partition(".")[0] for p in drawn.stage.parameters)
+    risk = settings.risk
+    return (
+        f"gaits are searched for in {settings.draws} of {len(drawn.models)} models that differ in {', '.join(called)}; "
+        f"what counts is their mean speed, by {100 * risk.weight:.0f} % that in the worst {100 * risk.share:.0f} %, "
+        f"and a fall as -{risk.fall:g} m/s"
+    )
 
 
 def _told(t: Tried, foreseen: Foreseen) -> str:
