@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -35,6 +36,7 @@ from sysid_btr.io.validation import validate_log
 from sysid_btr.models import ant as ant_module
 from sysid_btr.models.ant import SegmentLength
 from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import Robot as RobotModel
 from sysid_btr.report.btr import draw_btr
 from sysid_btr.result import to_json
 from sysid_btr.simulation.compiling import make_index
@@ -565,6 +567,45 @@ def test_effects_are_found_in_trials_of_a_robot_that_stands_on_its_own() -> None
     assert abs(joined.model.values[-1] - 0.03) < 0.002
     assert np.all(np.abs(joined.model.values[:2] - TRUTH) < np.abs(1 - TRUTH))
     assert joined.simulations > 10
+
+
+def tied() -> RobotModel:
+    """The ant with two hips that mirror each other, which those of `hidden` do not."""
+
+    def spec() -> mujoco.MjSpec:
+        made = MODEL.make_spec()
+        made.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1="LFCoxa", name2="LMCoxa").data[1] = -1
+        return made
+
+    return replace(MODEL, make_spec=spec)
+
+
+@pytest.mark.parametrize("settings", [TINY, IMPROVING, LEAST], ids=["one model", "drawn models", "likelihood"])
+def test_a_tie_that_the_robot_lacks_is_left_out_once_trials_show_it(settings: Settings, tmp_path: Path) -> None:
+    said: list[str] = []
+    outcome = back_to_reality(
+        tied(), terms(), hidden(), SPACE, task=TASK, settings=settings, threads=1, folder=tmp_path, say=said.append
+    )
+    first, *later = outcome.iterations
+    assert outcome.stage.world.model.neq == 0
+    assert len(first.untied) == 1
+    assert not any(i.untied for i in later)
+    assert all("are not tied" in text for text in (*first.untied, outcome.to_dict()["message"], "".join(said)))
+    # from then on gaits run, and the trials are explained, in a model without it
+    plain = Stage(make_world(MODEL, TASK, terms(), threads=1), TASK, SPACE)
+    controllers = np.array([t.controller.values for t in outcome.tried])
+    np.testing.assert_array_equal(
+        outcome.stage.fitness(controllers, outcome.model[None]), plain.fitness(controllers, outcome.model[None])
+    )
+    again = back_to_reality(tied(), terms(), hidden(), SPACE, task=TASK, settings=settings, threads=1, folder=tmp_path)
+    assert same(outcome, again)
+
+
+def test_a_tie_that_the_robot_has_stays() -> None:
+    robot = HiddenRobot(make_world(tied(), TASK, terms(), threads=1), TRUTH, TASK, SPACE, Noise())
+    outcome = back_to_reality(tied(), terms(), robot, SPACE, task=TASK, settings=TINY, threads=1)
+    assert outcome.stage.world.model.neq == 1
+    assert not any(i.untied for i in outcome.iterations)
 
 
 @pytest.mark.parametrize("apart", [True, False])

@@ -40,6 +40,7 @@ from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot as RobotModel
+from sysid_btr.models.ties import as_logged
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
 from sysid_btr.units import probability
@@ -196,6 +197,7 @@ class _Loop:
         found, journal = self._search_controllers(number, drawn)
         promise = self._try(number, pool_of(journal.records, self.book.known), drawn)
         tried = self.book.of(number)
+        untied = self._untie()
         last = journal.records[-1].arrays["loss"] if journal.records else np.full(1, np.nan)
         transfer = _mean([abs(t.expected - t.trial.fitness) for t in tried if t.trial.outcome != "crashed"])
         joined, before = "", self.values
@@ -212,7 +214,7 @@ class _Loop:
         report = self._report(number, found, last, tried, transfer, problem, searched, joined)
         if self.settings.learn:
             self.belief = Belief.before(self.terms).towards(self.values, report.noise)
-        return replace(report, population_names=names, promise=promise)
+        return replace(report, population_names=names, promise=promise, untied=untied)
 
     def _imagine(self, number: int) -> Imagination:
         """Models drawn from what is believed after the iterations before, and chosen by what was tried."""
@@ -293,6 +295,17 @@ class _Loop:
             found = self.cloud.done.models(self.picked).beside(found)
         controllers = np.reshape([*before, *pool.controllers], (-1, len(self.space.names)))
         return Outlook(controllers, found, np.arange(len(before), len(controllers)))
+
+    def _untie(self) -> tuple[str, ...]:
+        """Leave out ties of the model that the trials contradict, in all that comes; a remark on each."""
+        known = self.model.remarks
+        logs = [t.trial.log for t in self.book.made if t.trial.log is not None and t.trial.outcome != "crashed"]
+        model = as_logged(self.model, logs)
+        if model is self.model:
+            return ()
+        self.model, self.cloud = model, None
+        self.stage = self._stage(self.terms)
+        return model.remarks[len(known) :]
 
     def _remembered(self) -> list[Tried]:
         """Trials that Step 3 explains: half of them the newest, the others from all before, evenly."""
@@ -509,4 +522,4 @@ def _line(r: Iteration) -> str:
     ]
     if r.promise is not None:
         parts.append(f"a trial promised {r.promise:.2g} m/s")
-    return ", ".join(parts) + (f"; {r.joined}" if r.joined else "")
+    return "; ".join([", ".join(parts), *r.untied, *([r.joined] if r.joined else [])])

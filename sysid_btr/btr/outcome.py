@@ -45,6 +45,7 @@ class Iteration:
     joined : what `close` said, if it ran.
     promise : what the first trial was worth beforehand, m/s: the gain to be expected, times the chance to stand; None
         where one model chose. Nothing is tried where that is less than is worthwhile.
+    untied : a remark on each tie of joints that the trials so far contradict, and that is left out of the model.
     """
 
     number: int
@@ -66,6 +67,7 @@ class Iteration:
     joined: str = ""
     promise: float | None = None
     population_names: tuple[str, ...] = ()
+    untied: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +239,7 @@ def _message(outcome: BackToReality) -> str:
         f"{best.trial.fitness:.4g} m/s on the robot (trial {best.controller.label}; {started:.4g} in the first "
         f"iteration) after {len(outcome.tried)} trials{f', {fell} of which fell or crashed' if fell else ''}; the "
         f"model predicts fitness within {outcome.iterations[-1].transfer:.2g} m/s, {first.transfer:.2g} at first. "
-        f"{_foreseen(outcome)}{outcome.reason}"
+        f"{_foreseen(outcome)}{_untied(outcome)}{outcome.reason}"
     )
 
 
@@ -254,6 +256,10 @@ def _foreseen(outcome: BackToReality) -> str:
         f"Of {len(told)} trials {held} lay in their 90 % interval; {falls:.1f} falls were foreseen, {fell} happened."
         f"{worth} "
     )
+
+
+def _untied(outcome: BackToReality) -> str:
+    return "".join(f"After iteration {i.number}: {remark}. " for i in outcome.iterations for remark in i.untied)
 
 
 def _iteration(i: Iteration) -> dict[str, Any]:
