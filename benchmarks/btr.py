@@ -53,14 +53,14 @@ TASK, SPACE, NAO = Walk(8.0), NaoGait(), load_robot("nao")
 BODIES = tuple(NAO.model.body(b).name for b in range(1, NAO.model.nbody))
 LEGS = tuple(j for j in SPACE.joints if any(part in j for part in ("Hip", "Knee", "Ankle")))
 REPORTED = (1, 4, 10, 16, 20)
-"""Trials after which the best so far is told."""
+"""Trials after which the best so far is told; of a run that ended before, its last."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """What a run may spend."""
 
-    iterations: int = 4
+    iterations: int = 5
     trials: int = 4
     draws: int = 6
     generations: int = 5
@@ -286,7 +286,7 @@ def _row(f: Mapping[str, Any]) -> dict[str, Any]:
     fitness = np.where(stood, [t["fitness"] for t in f["trials"]], 0.0)
     best = np.maximum.accumulate(fitness)
     told = [(t, t["foreseen"]) for t in f["trials"] if t["foreseen"]]
-    first = f["plan"]["trials"]
+    first, planned = f["plan"]["trials"], f["plan"]["trials"] * f["plan"]["iterations"]
     return {
         "robot": f["robot"],
         "seed": f["seed"],
@@ -295,7 +295,7 @@ def _row(f: Mapping[str, Any]) -> dict[str, Any]:
         "fell": int(np.sum(~stood)),
         "later": len(stood) - first,
         "fell_later": int(np.sum(~stood[first:])),
-        "best": {str(n): float(best[n - 1]) for n in REPORTED if n <= len(best)},
+        "best": {str(n): float(best[min(n, len(best)) - 1]) for n in REPORTED if n <= max(len(best), planned)},
         "held": sum(s["low"] <= t["fitness"] <= s["high"] for t, s in told),
         "told": len(told),
         "falls_foreseen": float(sum(1 - s["stands"] for _, s in told)),

@@ -135,6 +135,16 @@ def test_models_that_do_as_the_robot_did_count_and_others_still_do() -> None:
     np.testing.assert_array_equal(untried, np.zeros(48))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_trial_that_loses_its_step_does_not_decide_which_models_count(seed: int) -> None:
+    drawn, own, stands = world(seed, models=48)
+    drawn.fitness[17], drawn.fell[17] = own, ~stands
+    seen = np.arange(12)
+    real, stood = own[seen], stands[seen]
+    real[np.flatnonzero(stood)[:2]] -= 1.0
+    assert np.argmax(log_weights(drawn.of(seen), real, stood)) == 17
+
+
 def offer(mean: list[float], stands: list[float], near: list[bool]) -> Offer:
     n = len(mean)
     foresight = Foresight(np.array(mean), np.full(n, 0.01), np.array(stands))

@@ -19,7 +19,8 @@ ASKED = "outcomes"
 APART = 0.01
 """Root mean square difference, fraction of the range, from which controllers are two."""
 OTHERWISE = 0.1
-"""Probability that the robot falls where the right model stands, or the other way round."""
+"""Probability that a trial on the robot goes another way than in the right model: it falls, stands or loses its step
+where that does not. So no single trial decides which models are believed."""
 OFF = 0.2
 """Standard deviation of real fitness about that of the right model, over the fitness of trials."""
 LEFT = 0.25
@@ -80,11 +81,10 @@ def log_weights(tried: Drawn, real: FloatArray, stood: BoolArray) -> FloatArray:
     real, stood : (t,) what they did on the robot; of one that fell only that counts.
     """
     up = ~tried.fell & np.isfinite(tried.fitness)
-    evidence = np.sum(np.where(up == stood, np.log(1 - OTHERWISE), np.log(OTHERWISE)), axis=1)
     scale = OFF * float(np.sqrt(np.mean(real[stood] ** 2))) if stood.any() else 0.0
-    if scale > 0:
-        both = up & stood
-        evidence = evidence - 0.5 * np.sum(np.where(both, (tried.fitness - real) / scale, 0.0) ** 2, axis=1)
+    off = np.where(up & stood, tried.fitness - real, 0.0) / (scale or 1.0)
+    alike = np.where(up == stood, np.exp(-0.5 * off**2), 0.0)
+    evidence = np.sum(np.log((1 - OTHERWISE) * alike + OTHERWISE), axis=1)
     evidence = evidence - evidence.max()
     temper = 1.0
     while _count(temper * evidence) < LEFT * len(evidence):
