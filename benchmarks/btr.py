@@ -231,6 +231,9 @@ METHODS: Mapping[str, Callable[[DrakeRobot, int, Plan, Path], list[dict[str, Any
 }
 
 
+OURS = ("loop", "learning")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; 0 when the table is written."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.btr", description=__doc__)
@@ -263,10 +266,16 @@ def run(name: str, method: str, seed: int, plan: Plan, out: Path) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     print(f"{name} {seed} {method}", flush=True)
-    robot, cpu = DrakeRobot(NAO, TASK, SPACE, ROBOTS[name](seed), seed=seed), process_time()
-    trials = METHODS[method](robot, seed, plan, folder)
+    spent = folder / "cpu_s.json"
+    cpu = (json.loads(spent.read_text()) if spent.exists() else 0.0) - process_time()
+    robot = DrakeRobot(NAO, TASK, SPACE, ROBOTS[name](seed), seed=seed)
+    try:
+        trials = METHODS[method](robot, seed, plan, folder)
+    finally:
+        cpu += process_time()
+        spent.write_text(json.dumps(cpu))
     found = {"robot": name, "method": method, "seed": seed, "plan": vars(plan), "truth": asdict(robot.truth)}
-    done.write_text(to_json({**found, "trials": trials, "cpu_s": process_time() - cpu}))
+    done.write_text(to_json({**found, "trials": trials, "cpu_s": cpu}))
 
 
 def table(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -274,10 +283,31 @@ def table(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     rows = [_row(f) for f in found]
     methods = [m for m in METHODS if any(r["method"] == m for r in rows)]
     return {
-        "command": "python -m benchmarks.btr --seeds " + " ".join(map(str, sorted({r["seed"] for r in rows}))),
+        "command": " ".join(
+            ["python -m benchmarks.btr", *(f"--{k}s {_listed(rows, k)}" for k in ("robot", "method", "seed"))]
+        ),
         "runs": rows,
         "methods": {m: _over([r for r in rows if r["method"] == m]) for m in methods},
+        "ahead_after_10_of_others_at_the_end": {m: _ahead(rows, m) for m in methods if m in OURS},
     }
+
+
+def _listed(rows: Sequence[Mapping[str, Any]], key: str) -> str:
+    return " ".join(map(str, dict.fromkeys(r[key] for r in rows)))
+
+
+def _ahead(rows: Sequence[Mapping[str, Any]], method: str) -> dict[str, str]:
+    """On how many of the robots that both were run on a method's best of 10 trials beats all trials of another."""
+    best = {(r["robot"], r["seed"], r["method"]): list(r["best"].values()) for r in rows}
+    halfway = {
+        key[:2]: r["best"]["10"] for key, r in zip(best, rows, strict=True) if key[2] == method and "10" in r["best"]
+    }
+    found = {}
+    for other, trial, called in [("nominal", 0, "blind"), *((m, -1, m) for m in METHODS if m not in OURS)]:
+        pairs = [(own, best[(*robot, other)][trial]) for robot, own in halfway.items() if (*robot, other) in best]
+        if pairs:
+            found[called] = f"{sum(own > theirs for own, theirs in pairs)} of {len(pairs)}"
+    return found
 
 
 def _row(f: Mapping[str, Any]) -> dict[str, Any]:
@@ -338,6 +368,10 @@ def show(summary: Mapping[str, Any]) -> str:
         best = ", ".join(f"{b:.3f} after {n}" for n, b in m["best_median"].items())
         fell = "" if falls is None else f", {falls:.0%} after the first iteration"
         lines.append(f"{name}: {m['runs']} runs, {m['fell']:.0%} of trials fell{fell}; median best {best}{held}")
+    for name, ahead in summary["ahead_after_10_of_others_at_the_end"].items():
+        lines.append(
+            f"{name} after 10 trials ahead of all trials of: " + ", ".join(f"{m} {k}" for m, k in ahead.items())
+        )
     return "\n".join(lines)
 
 

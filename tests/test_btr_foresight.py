@@ -65,7 +65,8 @@ def test_an_interval_holds_what_a_fall_leaves() -> None:
     sure = Foresight(np.array([0.05]), np.array([0.001]), np.array([0.999])).of(0)
     risky = Foresight(np.array([0.05]), np.array([0.001]), np.array([0.5])).of(0)
     assert (sure.low, sure.high) == pytest.approx((0.05 - 0.00164, 0.05 + 0.00164), abs=2e-4)
-    assert risky.low < 0.01
+    # it may have staggered backwards before
+    assert risky.low == pytest.approx(-0.04, abs=2e-3)
     assert risky.high == pytest.approx(sure.high, abs=1e-3)
 
 

@@ -103,13 +103,13 @@ class Foresight:
         return np.asarray(self.stands * self.std * (z * norm.cdf(z) + norm.pdf(z)))
 
     def of(self, row: int, level: float = 0.9) -> Foreseen:
-        """Of one, with an interval: a run that falls ends at any moment, having gone so far."""
+        """Of one, with an interval: a run that falls ends anywhere, at most as far back as it would have gone ahead."""
         from scipy.stats import norm
 
         mean, std, stands = float(self.mean[row]), float(self.std[row]), float(self.stands[row])
         part = (np.arange(GRID) + 0.5) / GRID
         normal = mean + std * norm.ppf(part)
-        cut = np.outer(part, normal).ravel()
+        cut = np.outer(2 * part - 1, normal).ravel()
         values = np.concatenate([normal, cut])
         weights = np.concatenate([np.full(GRID, stands / GRID), np.full(GRID**2, (1 - stands) / GRID**2)])
         order = np.argsort(values)
