@@ -56,6 +56,10 @@ REPORTED = (1, 4, 10, 16, 20)
 """Trials after which the best so far is told; of a run that ended before, its last."""
 
 
+APART = 0.1
+"""Root mean square difference, fraction of the range, of gaits of one search that are tried without learning."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """What a run may spend."""
@@ -167,7 +171,7 @@ def shot(trial: Trial, foreseen: Mapping[str, Any] | None = None, expected: floa
 
 
 def randomised(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[dict[str, Any]]:
-    """One search over the prior, as many simulations as the loop's, its best gaits tried in order."""
+    """One search over the prior, as many simulations as the loop's; its best gaits, no two alike, tried in order."""
     terms = parse_parameters(list(FREE), NAO)
     others, unmeasured = Belief.unmeasured(NAO, terms)
     stage = Stage(make_world(NAO, TASK, (*terms, *others), threads=1), TASK, SPACE)
@@ -176,7 +180,7 @@ def randomised(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[d
     journal = Journal(folder / "search.jsonl")
     search = replace(plan.search, max_generations=2 * plan.generations * plan.iterations)
     search.fit(problem, rng=np.random.default_rng([seed, 71]), budget=Budget(), journal=journal, progress=silent)
-    best = Imagination(stage, models).shortlist(pool_of(journal.records, set()), plan.count)
+    best = Imagination(stage, models).shortlist(pool_of(journal.records, set()), plan.count, APART)
     return [shot(robot.run(Controller(c)), None, float(e)) for c, e in zip(*vars(best).values(), strict=True)]
 
 

@@ -59,12 +59,12 @@ class Imagination:
         """Some of the models."""
         return Imagination(self.stage, self.models[rows])
 
-    def shortlist(self, pool: Pool, count: int) -> Pool:
+    def shortlist(self, pool: Pool, count: int, apart: float = APART) -> Pool:
         """So many of a pool, those worth most, none of which is nearly another one."""
         rows: list[int] = []
         unit = self.unit(pool.controllers)
         for i in np.argsort(-pool.expected, kind="stable"):
-            if len(rows) < count and all(np.sqrt(np.mean((unit[i] - unit[j]) ** 2)) > APART for j in rows):
+            if len(rows) < count and all(np.sqrt(np.mean((unit[i] - unit[j]) ** 2)) > apart for j in rows):
                 rows.append(int(i))
         return Pool(pool.controllers[rows], pool.expected[rows])
 
