@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.walks import CONTACT, INERTIAL
+from benchmarks.walks import INERTIAL
 from sysid_btr.identify.fit import fit
+from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 RESULTS = Path(__file__).parent / "results" / "ground.csv"
 BODIES = ("KneePitch", "HipPitch", "HipRoll", "ShoulderRoll")
 PERIOD, STEP, TICK = 0.02, 5e-4, 2 * np.pi / 4096
+CONTACT = ("foot_compliance:*AnkleRoll=shared", "foot_friction:*AnkleRoll=shared")
 SECONDS = 12.0
 UPRIGHT = 0.4
 """rad, tilt beyond which a robot has fallen; another one is drawn."""
@@ -208,7 +210,7 @@ def _log(
 
 def examine(walker: Walker, log: Log, threads: int) -> pd.DataFrame:
     """One row for each parameter of which the truth is known."""
-    found = fit(make_study(load_robot("nao"), [log], threads=threads), [*INERTIAL, *CONTACT])
+    found = fit(make_study(load_robot("nao"), [log], mode=Mode("segments"), threads=threads), [*INERTIAL, *CONTACT])
     truth = {f"mass:{name}": factor for name, factor in walker.masses.items()}
     truth |= {"kp:*": walker.kp, "kv:*": walker.kv, "foot_friction:*AnkleRoll": walker.ground.friction}
     score = found.before.holdout["position"]

@@ -31,7 +31,6 @@ from sysid_btr.result import to_json
 
 RESULTS = Path(__file__).parent / "results" / "walks.json"
 INERTIAL = ("mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared")
-CONTACT = ("foot_compliance:*AnkleRoll=shared", "foot_friction:*AnkleRoll=shared")
 FLOOR = 1.5
 """Held-out position rmse over the noise floor that is allowed."""
 LEGS, LEG_ERROR = ("HipPitch", "KneePitch"), 0.10
@@ -57,18 +56,11 @@ class Folders:
         return make_study(robot, [read_log(self.data / f"{n}.parquet") for n in logs], threads=self.threads)
 
 
-def truth_of(name: str, masses: Mapping[str, float]) -> float | None:
-    """Scale factor in the recording; None for what another contact model has no counterpart of."""
-    if name.startswith("foot_compliance"):
-        return None
-    return 0.8 if name.startswith("foot_friction") else masses.get(name, 1.0)
-
-
 def rows(parameters: Sequence[Mapping[str, Any]], masses: Mapping[str, float]) -> list[dict[str, Any]]:
     """One line a parameter: truth, estimate, interval, whether the one lies in the other."""
     result = []
     for p in parameters:
-        truth = truth_of(p["name"], masses)
+        truth = masses.get(p["name"], 1.0)
         low, high = p["ci95"]
         result.append(
             {
@@ -78,15 +70,15 @@ def rows(parameters: Sequence[Mapping[str, Any]], masses: Mapping[str, float]) -
                 "std": p["std"],
                 "ci95": [low, high],
                 "identifiable": p["identifiable"],
-                "inside": None if truth is None else bool(low <= truth <= high),
+                "inside": bool(low <= truth <= high),
             }
         )
     return result
 
 
 def fit_a(folders: Folders) -> dict[str, Any]:
-    """Masses, gains and contact from walk_a."""
-    result = fit(folders.study("nao_walk/walk_a"), [*INERTIAL, *CONTACT]).to_dict()
+    """Masses and gains from walk_a."""
+    result = fit(folders.study("nao_walk/walk_a"), list(INERTIAL)).to_dict()
     found = rows(result["parameters"], MASSES_A)
     ratio = over_floor(result)
     legs = {r["name"]: abs(r["value"] / r["truth"] - 1) for r in found if r["name"].endswith(LEGS)}
@@ -94,7 +86,7 @@ def fit_a(folders: Folders) -> dict[str, Any]:
         "parameters": found,
         "over_floor": ratio,
         "missed": [
-            *(f"{r['name']} outside its ci95" for r in found if r["inside"] is False),
+            *(f"{r['name']} outside its ci95" for r in found if not r["inside"]),
             *(f"{name} {100 * e:.0f} % off" for name, e in legs.items() if e > LEG_ERROR),
             *([f"held-out {ratio:.2f} noise floors"] if ratio > FLOOR else []),
         ],
@@ -116,7 +108,7 @@ def closing(folders: Folders, log: str, masses: Mapping[str, float]) -> tuple[di
         "effects": result["effects"],
         "steps": result["steps"],
     }
-    return content, [f"{r['name']} outside its ci95" for r in found if r["inside"] is False]
+    return content, [f"{r['name']} outside its ci95" for r in found if not r["inside"]]
 
 
 def close_a(folders: Folders) -> dict[str, Any]:
@@ -193,7 +185,7 @@ def together(folders: Folders) -> dict[str, Any]:
         "smaller": smaller,
         "missed": [
             *(f"{p}: the interval of both is no smaller" for p, ok in smaller.items() if not ok),
-            *(f"{r['name']} outside its ci95" for r in found if r["inside"] is False),
+            *(f"{r['name']} outside its ci95" for r in found if not r["inside"]),
         ],
     }
 

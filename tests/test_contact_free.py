@@ -10,11 +10,13 @@ import pytest
 from walks import record_walk
 
 from benchmarks import ground
-from sysid_btr.floating_base import contact_free
-from sysid_btr.floating_base.contact_free import difference, without_ground
+from sysid_btr.floating_base import chain as chain_module
+from sysid_btr.floating_base.chain import difference
+from sysid_btr.floating_base.contact_free import without_ground
 from sysid_btr.floating_base.segments import FloatingReplay
 from sysid_btr.floating_base.size import NAO
 from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
@@ -76,7 +78,7 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
     n, joints, feet, p = 5, 3, 2, 4
     states = random_states(n, joints, rng)
     d, w = states.std.shape[1], n - 1
-    chain = contact_free._Chain(
+    chain = chain_module.Chain(
         steps=cast(Any, None),
         states=states,
         touch=np.ones((w, feet), dtype=bool),
@@ -87,13 +89,13 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
         size=replace(NAO, weight=0.01),
     )
     shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3]
-    known = contact_free._Derivatives(*(0.1 * rng.normal(size=s) for s in shapes))
-    ends = contact_free._Ends(1e-3 * rng.normal(size=(w, d)), 1e-3 * rng.normal(size=(w, d, p)))
-    found = contact_free._linearise(chain, known, ends)
+    known = chain_module.Derivatives(*(0.1 * rng.normal(size=s) for s in shapes))
+    ends = chain_module.Ends(1e-3 * rng.normal(size=(w, d)), 1e-3 * rng.normal(size=(w, d, p)))
+    found = chain_module.linearise_chain(chain, known, ends)
 
-    sizes, forces, _ = contact_free._unexplained(chain, known)
-    slack, loose = (contact_free._each(kinds, chain) for kinds in (contact_free.SLACK, contact_free.LOOSE))
-    sight, seen = contact_free._measurements(chain)
+    sizes, forces, _ = chain_module.unexplained(chain, known)
+    slack, loose = (chain_module.each_of(kinds, chain) for kinds in (chain_module.SLACK, chain_module.LOOSE))
+    sight, seen = chain_module.measurements(chain)
     k = len(sizes)
     unknown = n * d + w * k
     rows, rests, numbers = [np.zeros((n * d, unknown))], [np.zeros(n * d)], [np.zeros((n * d, p))]
@@ -135,7 +137,7 @@ def on_springs() -> OnSprings:
         patch.setattr(ground, "SECONDS", 5.5)
         log = ground.record(walker)
     assert log is not None
-    study = make_study(load_robot("nao"), [log])
+    study = make_study(load_robot("nao"), [log], mode=Mode("segments"))
     return walker, study, *problem_of(study)
 
 
@@ -176,17 +178,17 @@ def test_masses_come_out_whatever_the_ground_is(on_springs: OnSprings) -> None:
 
 def test_a_model_that_lacks_something_else_is_contradicted() -> None:
     log, _ = record_walk(Gait(), 4.0, delay=0.04, seed=2)
-    problem, begin = problem_of(make_study(load_robot("nao"), [log]))
+    problem, begin = problem_of(make_study(load_robot("nao"), [log], mode=Mode("segments")))
     assert without_ground(problem, begin) is None
 
 
 def test_logs_that_do_not_suit_are_left_alone(on_springs: OnSprings) -> None:
     replay = on_springs[2].episodes[0].replay
     assert isinstance(replay, FloatingReplay)
-    assert contact_free._suits(replay)
+    assert chain_module.suits(replay)
     time = replay.log.time.copy()
     time[1::2] += 0.003
-    assert not contact_free._suits(replace(replay, log=replace(replay.log, time=time)))
-    assert not contact_free._suits(replace(replay, numerics=replace(replay.numerics, servo_period=0.01)))
-    short = replay.log.window(0, contact_free.LEAST - 1)
-    assert not contact_free._suits(replace(replay, log=short))
+    assert not chain_module.suits(replace(replay, log=replace(replay.log, time=time)))
+    assert not chain_module.suits(replace(replay, numerics=replace(replay.numerics, servo_period=0.01)))
+    short = replay.log.window(0, chain_module.LEAST - 1)
+    assert not chain_module.suits(replace(replay, log=short))

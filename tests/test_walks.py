@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from toys import pendulum, swing
-from walks import Scale, Truth, plain_walk, record_walk
+from walks import Scale, Truth, heavier, plain_walk, record_walk
 
 from sysid_btr.errors import LogError
 from sysid_btr.estimators import Budget, Journal, silent
@@ -25,6 +25,7 @@ from sysid_btr.floating_base.strides import of_legs, repeated_error, stride
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
@@ -44,6 +45,7 @@ from sysid_btr.terms.inertial import GravityTilt
 from sysid_btr.terms.servo import CommandDelay
 
 FINE = Numerics("RK4", 0.001)
+WINDOWS = Mode("segments")
 LENGTH = 10
 
 
@@ -323,20 +325,12 @@ def test_a_log_with_too_little_walking_is_refused() -> None:
 # --- fits -----------------------------------------------------------------------------------------------
 
 
-def heavier(name: str, factor: float):  # type: ignore[no-untyped-def]
-    def edit(spec: mujoco.MjSpec) -> None:
-        geom = next(g for g in spec.body(name).geoms if g.mass > 0)
-        geom.mass *= factor
-
-    return edit
-
-
 def nao_study(*logs: Log, numerics: Numerics | None = None) -> Study:
     """A study of the Nao whose segments have one of two lengths; what chooses among more is tested above."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segments_module, "LENGTHS", (0.2, 0.3))
         patch.setattr(segments_module, "TRIED", 4)
-        return make_study(load_robot("nao"), logs, numerics=numerics, threads=2)
+        return make_study(load_robot("nao"), logs, numerics=numerics, mode=WINDOWS, threads=2)
 
 
 @cache
@@ -424,7 +418,7 @@ def small_study(length: float) -> Study:
     with pytest.MonkeyPatch.context() as patch, scale.sensors():
         patch.setattr(segments_module, "LENGTHS", (0.1, 0.2))
         patch.setattr(segments_module, "TRIED", 2)
-        return make_study(scale.robot, [scale.log(plain_walk()[0].window(50, 150))], threads=2)
+        return make_study(scale.robot, [scale.log(plain_walk()[0].window(50, 150))], mode=WINDOWS, threads=2)
 
 
 @pytest.mark.slow

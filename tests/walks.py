@@ -123,6 +123,16 @@ def record_walk(
     return log, Truth(**motion, joints=joints, model=model)
 
 
+def heavier(name: str, factor: float) -> Callable[[mujoco.MjSpec], None]:
+    """A change of a robot by which one of its bodies has another mass."""
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        geom = next(g for g in spec.body(name).geoms if g.mass > 0)
+        geom.mass *= factor
+
+    return edit
+
+
 @cache
 def plain_walk() -> tuple[Log, Truth]:
     """Ten seconds of the default walk."""

@@ -58,7 +58,12 @@ def references() -> tuple[Reference, ...]:
         Reference("fit_gantry_c", "fit", hung, INERTIAL, gantry / "gantry_c.parquet", 10.0),
         Reference("close_gantry_d", "close", hung, INERTIAL, gantry / "gantry_d.parquet", 10.0),
         Reference(
-            "fit_walk_a", "fit", str(walk / "nominal_free.xml"), (*INERTIAL, *CONTACT), walk / "walk_a.parquet", 8.0
+            "fit_walk_a",
+            "fit",
+            str(walk / "nominal_free.xml"),
+            (*INERTIAL, *CONTACT, "--mode", "segments"),
+            walk / "walk_a.parquet",
+            8.0,
         ),
         Reference(
             "btr_ant",

@@ -36,6 +36,11 @@ def eliminate(state: State, rules: Selection, progress: Progress) -> State:
     if not state.effects:
         return state
     state = _merged(exchange(state, rules), rules)
+    for _ in range(state.study.procedure.last_turns):
+        # they were those of a model that lacked its last effect
+        study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)
+        again = refit(study, state.fitted.model)
+        state = replace(state, study=study, fitted=again).spent(again.evaluations)
     study = inflate(state.study, state.fitted, memory=True)
     progress(done=rules.rounds, total=None, best=state.fitted.holdout, note="final fit")
     polished = refit(study, state.fitted.model, polish=True, progress=progress)

@@ -119,21 +119,18 @@ def certainty_words(effect: Mapping[str, Any]) -> str:
 
 def episode_words(result: Mapping[str, Any]) -> Iterator[str]:
     """How each fitted log was compared with the model, where that is not by one replay of all of it."""
-    for walk in result.get("walks", []):
-        if walk["part"] == "train":
-            yield "; ".join(_walk_words(walk))
-    for episode in result.get("episodes", []):
+    for episode in (*result.get("walks", []), *result.get("episodes", [])):
         if episode["part"] == "train":
-            yield episode["summary"] + (f" ({episode['why']})" if episode["why"] else "")
+            yield "; ".join(_episode_words(episode))
 
 
-def _walk_words(walk: Mapping[str, Any]) -> Iterator[str]:
-    """What was done with a floating-base log."""
-    yield f"floating base: {walk['windows']} segments of {walk['window']:.2g} s fitted, each from an estimated state"
-    if walk["counted_less"]:
-        yield f"{walk['counted_less']} of them, mostly impacts, count less"
-    yield from walk["events"]
-    yield from walk["lost"]
+def _episode_words(episode: Mapping[str, Any]) -> Iterator[str]:
+    """What was done with one log."""
+    yield episode["summary"] + (f" ({episode['why']})" if episode.get("why") else "")
+    if episode.get("counted_less"):
+        yield f"{episode['counted_less']} of them, mostly impacts, count less"
+    yield from episode.get("events", ())
+    yield from episode.get("lost", ())
 
 
 def stages(result: Mapping[str, Any]) -> list[tuple[str, str]]:

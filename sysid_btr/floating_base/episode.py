@@ -181,8 +181,12 @@ class FloatingEpisode(Episode):
 
     def facts(self) -> Mapping[str, Any]:
         weight = np.ones(0) if self.marginal is None else self.marginal.weight
+        seconds = segment_seconds(self.segments, self.log)
         return {
-            "window": segment_seconds(self.segments, self.log),
+            "mode": "segments",
+            "summary": f"floating base: {len(self.segments)} segments of {seconds:.2g} s fitted, each from an "
+            "estimated state",
+            "window": seconds,
             "windows": len(self.segments),
             "counted_less": int(np.sum(weight < COUNTED_LESS)),
             "windows_tried": [asdict(length) for length in self.lengths],

@@ -24,10 +24,11 @@ KINDS = {
     "segments": "sysid_btr.identify.segmented:SegmentedEpisode",
     "inverse": "sysid_btr.identify.inverse:InverseEpisode",
     "floating": "sysid_btr.floating_base.episode:FloatingEpisode",
+    "innovations": "sysid_btr.floating_base.innovations:InnovationsEpisode",
 }
 """Mode -> its kind of episode, by name: floating bases are a wing above this one."""
-MODES = (AUTO, "forward", "segments", "inverse")
-"""What can be asked for; a floating base has a mode of its own."""
+MODES = (AUTO, "forward", "segments", "inverse", "innovations")
+"""What can be asked for; segments of a floating base are a kind of their own."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +113,7 @@ def _length(name: str, mode: Mode) -> dict[str, float]:
 def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str]:
     """The mode of one log, and why."""
     if log.meta.mount == "free":
-        if mode.asked not in (AUTO, "forward"):
-            raise UsageError(
-                f"--mode {mode.asked}: {log.path or 'the log'} is of a floating base, which is replayed by segments of "
-                "its own"
-            )
-        return "floating", "its base floats"
+        return _of_floating(robot, log, mode)
     if mode.asked != AUTO:
         return mode.asked, "as asked for"
     joints = joint_names(robot)
@@ -129,6 +125,27 @@ def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str
     if followed.open_loop:
         return "forward", ""
     return "segments", f"open loop, the plain model can be followed for {followed.seconds:.2g} s"
+
+
+def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
+    """The mode of a log whose base floats, and why."""
+    suited = _kind("innovations").suits(robot, log)
+    if mode.asked == "innovations" and not suited:
+        raise UsageError(
+            f"--mode innovations: {log.path or 'the log'} does not suit it: it takes samples at equal intervals, and a "
+            "model whose drives have no memory. Replay it by segments: --mode segments"
+        )
+    if mode.asked == "innovations":
+        return "innovations", "as asked for"
+    if mode.asked == AUTO:
+        return ("innovations", "its base floats") if suited else ("floating", "its base floats")
+    if mode.asked == "segments" and not mode.seconds > 0:
+        return "floating", "as asked for"
+    raise UsageError(
+        f"--mode {mode.asked}{f', --segments {mode.segments}' if mode.seconds > 0 else ''}: {log.path or 'the log'} is "
+        "of a floating base: choose --mode innovations, which asks nothing of the ground, or --mode segments, whose "
+        "length it chooses itself"
+    )
 
 
 def _commanded(log: Log) -> bool:

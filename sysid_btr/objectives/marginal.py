@@ -70,7 +70,7 @@ class Projection:
     def whiten(self, part: FloatArray) -> FloatArray:
         """Residuals (m, k) with the start integrated out."""
         # one product a candidate: the bits of a product of all would depend on how many there are
-        expected = (part + self.offset)[:, None]
+        expected = np.ascontiguousarray(part + self.offset)[:, None]
         shrink = 1 - 1 / np.sqrt(1 + self.gain**2)
         known = ((expected @ self.basis) * shrink) @ self.basis.T
         return np.asarray(self.weight * (expected - known)[:, 0])

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 SEGMENT = 1024
 """Steps per rollout call; bounds the records that are held at once."""
+SHARED = 0.5
+"""Fraction of simulations that differ from all others, up to which what is the same is derived once."""
 POSITION, VELOCITY, ACCELERATION = 1, 2, 3
 """Stages of MuJoCo's forward dynamics (mjtStage)."""
 
@@ -55,10 +57,33 @@ def _load(batch: BatchModel, state: Fields, threads: int) -> Batch:
     for name, values in batch.fields.items():
         simulations.expand(name)[...] = values
     if batch.derives:
-        simulations.set_const()
+        _derive(simulations, batch, threads)
     for name, values in state.items():
         simulations.bind(name)[...] = values
     return simulations
+
+
+def _derive(simulations: Batch, batch: BatchModel, threads: int) -> None:
+    """Let the engine derive what depends on changed fields, once for simulations in which these are the same."""
+    from mujoco import MjModel
+    from mujoco.batch import Batch
+
+    changed = [name for name in batch.fields if name in MjModel._setconst_inputs]
+    numbers = np.concatenate([batch.fields[name].reshape(batch.size, -1) for name in changed], axis=1)
+    first: dict[bytes, int] = {}
+    same = [first.setdefault(row.tobytes(), i) for i, row in enumerate(numbers)]
+    if len(first) > SHARED * batch.size:
+        simulations.set_const()
+        return
+    rows, own = np.unique(same, return_inverse=True)
+    few = Batch(batch.model, len(rows), threads)
+    for name in changed:
+        few.expand(name)[...] = batch.fields[name][rows]
+    few.set_const()
+    for name in MjModel._setconst_outputs:
+        derived = few.expanded(name)
+        if derived is not None and name not in changed:
+            simulations.expand(name)[...] = derived[own]
 
 
 def _roll(batch: Batch, setup: Setup, borders: IntArray) -> States:

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log
 
 SIMULATIONS = 96
-"""Simulations of one batch, at least."""
+"""Simulations of one batch, at least ..."""
+STEPS = 4096
+"""... and their steps: where each takes a few, more of them share what a batch costs."""
 WORTH = 0.8
 """Length of a segment, as a fraction of the longest of a batch, from which it shares the batch."""
 LEAD = 0.25
@@ -324,8 +326,9 @@ class SegmentReplay(Replay):
         groups: dict[int, list[int]] = {}
         for i in sorted(range(len(segment)), key=lambda i: self._clock[segment[i]]):
             groups.setdefault(int(segment[i]) if alone else self._frames[segment[i]].size, []).append(i)
-        most = max(SIMULATIONS, CHUNK_DOFS // max(self.model.nv, 1))
         for members in groups.values():
+            steps = max(self._frames[segment[i]].steps for i in members)
+            most = max(SIMULATIONS, CHUNK_DOFS // max(self.model.nv, 1), STEPS // steps)
             for first in range(0, len(members), most):
                 sims = np.array(members[first : first + most])
                 own = [(term, values[row[sims]]) for term, values in pairs]

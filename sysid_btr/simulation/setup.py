@@ -188,11 +188,13 @@ def lagged(batch: BatchModel, command: FloatArray) -> FloatArray:
     if not np.any(constant > 0):
         return command
     shaped = np.array(np.broadcast_to(command, (batch.size, *command.shape[1:])))
-    for row, drive in np.argwhere(constant > 0):
-        ratio = batch.timestep / constant[row, drive]
-        gone, u = -np.expm1(-ratio), shaped[row, :, driven[drive]]
-        y, _ = lfilter([0.0, gone], [1.0, gone - 1], u, zi=u[:1])
-        shaped[row, :, driven[drive]] = u + (y - u) * gone / ratio
+    for drive, joint in enumerate(driven):
+        for own in np.unique(constant[constant[:, drive] > 0, drive]):
+            rows = np.flatnonzero(constant[:, drive] == own)
+            ratio = batch.timestep / own
+            gone, u = -np.expm1(-ratio), shaped[rows, :, joint]
+            y, _ = lfilter([0.0, gone], [1.0, gone - 1], u, zi=u[:, :1])
+            shaped[rows, :, joint] = u + (y - u) * gone / ratio
     return shaped
 
 

@@ -245,15 +245,19 @@ def delay_command(command: FloatArray, columns: IntArray, steps: FloatArray) -> 
     Between whole steps the mean over the step is mixed, which is exact for a held command.
     """
     shifted = np.array(np.broadcast_to(command, (len(steps), *command.shape[1:])))
-    rows = np.arange(command.shape[1])
+    time = np.arange(command.shape[1])
     for place, column in enumerate(columns):
-        whole = np.floor(steps[:, place]).astype(np.int64)
-        part = (steps[:, place] - whole)[:, None]
-        late = np.maximum(rows[None, :] - whole[:, None], 0)
+        # most of many candidates delay nothing
+        rows = np.flatnonzero(steps[:, place])
+        if not len(rows):
+            continue
+        whole = np.floor(steps[rows, place]).astype(np.int64)
+        part = (steps[rows, place] - whole)[:, None]
+        late = np.maximum(time[None, :] - whole[:, None], 0)
         later = np.maximum(late - 1, 0)
-        later[rows[None, :] - whole[:, None] <= 0] = 0
-        source = np.broadcast_to(command[:, :, column], (len(steps), command.shape[1]))
+        later[time[None, :] - whole[:, None] <= 0] = 0
+        source = shifted[rows, :, column]
         near = np.take_along_axis(source, late, axis=1)
         far = np.take_along_axis(source, later, axis=1)
-        shifted[:, :, column] = (1 - part) * near + part * far
+        shifted[rows, :, column] = (1 - part) * near + part * far
     return shifted

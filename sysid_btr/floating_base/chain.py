@@ -1,0 +1,534 @@
+"""A walk as a chain of steps of one sample each, without contact.
+
+Forces and torques that nobody knows act on the feet that may touch; the states at the samples and these are what the
+encoders, the gyro and the vertical of the log leave most probable (simultaneous estimation of inputs and states:
+Gillijns and De Moor 2007, doi:10.1016/j.automatica.2006.08.002; as one sparse least-squares problem over the walk).
+Lengths, times and speeds below are the Nao's; `BodySize` makes them those of the robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.floating_base.estimate import NEAR, BaseState, foot_loads, imu_columns, lowest_points, vertical
+from sysid_btr.floating_base.feet import touching_bodies
+from sysid_btr.floating_base.segments import FloatingReplay, starts_at, whole_step
+from sysid_btr.floating_base.size import BodySize
+from sysid_btr.io.log import Log
+from sysid_btr.io.noise import noise_floor
+from sysid_btr.mujoco_conventions import to_rotation
+from sysid_btr.objectives.problem import BLOCK
+from sysid_btr.simulation.compiling import compile_model, make_index
+from sysid_btr.simulation.grid import Grid
+from sysid_btr.simulation.segments import BASE, BaseStates, SegmentReplay, Segments
+from sysid_btr.simulation.silence import silenced
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from sysid_btr.terms.base import BatchModel, Fields, JointAddresses, Term
+
+COARSE = 0.004
+"""s, longest step of the fourth-order integrator with which derivatives are taken."""
+STEADY, LEVER = 20.0, 0.07
+"""Standard deviation of the mean force on a foot over a sample, in weights of the robot: as good as free. Times the
+lever (m) it is that of the torque."""
+JOLTS = (0.0001, 0.0003, 0.001, 0.003, 0.009)
+"""The same of what the force does beside its mean, at either end of a sample, in weights times seconds: the likeliest
+of these, as a loose one lets noise pass for motion."""
+SLACK = (2e-5, 2e-5, 1e-3, 1e-3, 2e-5, 1e-3)
+"""By which a step may err for other reasons in base position, rotation, velocity, angular velocity, joint positions and
+joint velocities."""
+SLACKS = (1.0, 5.0, 25.0, 125.0)
+"""Factors on it that are tried: a model that lacks something errs by more, and must not draw the states with it."""
+LOOSE = (0.1, 0.3, 1.0, 3.0, 0.1, 5.0)
+"""Standard deviations by which a round may move the same: what nothing measures must stay somewhere."""
+NUDGE = (0.01, 0.001, 0.01, 0.01, 0.001, 0.02)
+"""Changes of the same by which derivatives are taken."""
+NUDGE_FORCE, NUDGE_TORQUE = 1.0, 0.1
+"""... and of forces, N, and torques, Nm."""
+NUDGE_NUMBER = 0.02
+"""Changes of the numbers by which derivatives are taken, fractions of their ranges."""
+LATE = 0.001
+"""s, standard deviation of what sensors and commands may be apart in time beyond the model: a tick of a loop at 1 kHz.
+A gain and a fraction of a millisecond look much alike. Of the bus, whatever the size of the robot."""
+LEAST = 50
+"""Samples that a walk must have."""
+
+
+@dataclass(frozen=True)
+class SampleSteps(FloatingReplay):
+    """Steps of one sample each, all from states of their own, without contact.
+
+    Attributes
+    ----------
+    wrench : (w, f, 6) force (N) and torque (Nm), in the world's axes, on the centre of mass of each foot.
+    late : steps of the integrator by which commands come later than the log has them.
+    """
+
+    wrench: FloatArray | None = None
+    late: int = 0
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        import mujoco
+
+        model = compile_model(self.robot, self.log, self.all_terms, self.numerics)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        return model
+
+    @cached_property
+    def index(self) -> JointAddresses:
+        return replace(make_index(self.model), base=self._free_joint)
+
+    @cached_property
+    def grid(self) -> Grid:
+        grid = super().grid
+        rows = np.maximum(np.arange(grid.steps) - self.late, 0)
+        return replace(grid, command=grid.command[rows], extra=grid.extra[rows])
+
+    @cached_property
+    def feet(self) -> list[int]:
+        """Bodies that touch the ground."""
+        return [self.model.body(foot.name).id for foot in touching_bodies(self.model)]
+
+    def push(self, segment: IntArray, change: FloatArray | None) -> Fields:
+        assert self.wrench is not None
+        wrench = self.wrench[segment]
+        if change is not None:
+            wrench = wrench + change[:, -wrench[0].size :].reshape(wrench.shape)
+        pushed = np.zeros((len(segment), self.model.nbody, 6))
+        pushed[:, self.feet] = wrench
+        return {"xfrc_applied": pushed}
+
+    def ends(self, candidates: FloatArray, row: IntArray, segment: IntArray, change: FloatArray | None) -> Segments:
+        """States at the ends of steps: of candidate `row`, in step `segment`, from a start with a `change`."""
+        size, j = len(row), len(self.index.joints)
+        base, q, dq = np.empty((size, 13)), np.empty((size, j)), np.empty((size, j))
+        with silenced():
+            for sims, part in self._simulate(candidates, row, segment, change):
+                assert part.base is not None
+                base[sims], q[sims], dq[sims] = part.base[:, -1], part.position[:, -1], part.velocity[:, -1]
+        # a simulation that failed has no attitude; the rest of it says so
+        failed = ~(np.linalg.norm(base[:, 3:7], axis=1) > 0.5)
+        base[failed] = np.nan
+        base[failed, 3:7] = 1.0, 0.0, 0.0, 0.0
+        std = np.zeros((size, BASE + 2 * j))
+        rows = np.asarray(self._segments.rows[segment])
+        return Segments(rows, q, dq, std, BaseStates(base[:, :3], base[:, 3:7], base[:, 7:10], base[:, 10:]))
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives:
+    """Of the end of each step: by its start (w, d, d), by the mean wrench and by blows at its start and its end."""
+
+    start: FloatArray
+    mean: FloatArray
+    blow: FloatArray
+    last: FloatArray
+
+    def part(self, start: int, stop: int) -> Derivatives:
+        """Those of the steps between the samples from `start` to before `stop`."""
+        own = slice(start, stop - 1)
+        return Derivatives(self.start[own], self.mean[own], self.blow[own], self.last[own])
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """One walk: its steps, states and what was measured.
+
+    Attributes
+    ----------
+    steps : replay from every state but the last.
+    states : (n) of the robot at the samples.
+    touch : (n - 1, f) whether a foot may touch during a step.
+    linked : (n - 1,) whether a step is replayed: both of its samples are usable.
+    measured, sigma : (n, j + 5) joint positions, gyro, and x and y of the vertical in the base's frame; sigma is
+        infinite where there is no value.
+    time : (n,) s since the first sample.
+    size : of the robot.
+    jolt, slack : one of `JOLTS`, and factor on `SLACK`, one of `SLACKS`.
+    """
+
+    steps: SampleSteps
+    states: Segments
+    touch: BoolArray
+    linked: BoolArray
+    measured: FloatArray
+    sigma: FloatArray
+    time: FloatArray
+    size: BodySize
+    jolt: float = JOLTS[2]
+    slack: float = 1.0
+
+    def part(self, start: int, stop: int) -> Chain:
+        """The chain of the samples from `start` to before `stop`."""
+        steps, samples, between = self.steps, slice(start, stop), slice(start, stop - 1)
+        assert steps.wrench is not None
+        assert steps.base is not None
+        assert steps.segments is not None
+        which = np.arange(start, stop)
+        return replace(
+            self,
+            steps=replace(
+                steps,
+                log=steps.log.window(start, stop),
+                segments=steps.segments.chosen(which[:-1]).shifted(start),
+                base=steps.base.rows(start, stop),
+                wrench=steps.wrench[between],
+            ),
+            states=self.states.chosen(which).shifted(start),
+            touch=self.touch[between],
+            linked=self.linked[between],
+            measured=self.measured[samples],
+            sigma=self.sigma[samples],
+            time=self.time[samples] - self.time[start],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """By how much steps miss the next state, (w, d), and how that depends on the numbers, (w, d, p)."""
+
+    defect: FloatArray
+    by_number: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """A chain linearised about its states: what a change of the numbers does to it, states and forces at their best.
+
+    Attributes
+    ----------
+    left : (r, 1 + p) whitened residuals for the numbers as they are, and their derivatives.
+    blocks : (r,) stretch of time of each.
+    surprise : minus twice the log likelihood, states and forces integrated out.
+    move : (n d, 1 + p) what the states do, for the numbers as they are and for a unit of each.
+    ends : from which this was made.
+    """
+
+    left: FloatArray
+    blocks: IntArray
+    surprise: float
+    move: FloatArray
+    ends: Ends
+
+    @property
+    def information(self) -> FloatArray:
+        return np.asarray(self.left[:, 1:].T @ self.left[:, 1:])
+
+    @property
+    def gradient(self) -> FloatArray:
+        return np.asarray(self.left[:, 1:].T @ self.left[:, 0])
+
+
+def suits(replay: FloatingReplay) -> bool:
+    """Whether a walk and its terms can be a chain."""
+    return (
+        replay.base is not None
+        and chainable(replay.log, replay.all_terms)
+        and replay.numerics.servo_period is None
+        and replay.numerics.integrator != "Euler"
+        and not any(name.startswith("opt.") for name in _written(replay, _nominal(replay)).fields)
+    )
+
+
+def chainable(log: Log, terms: Sequence[Term]) -> bool:
+    """Whether samples are regular, and enough, and no term needs more than a state."""
+    time = log.time
+    return (
+        len(time) >= LEAST
+        and float(np.ptp(np.diff(time))) < 1e-4 * float(time[1] - time[0])
+        and not any(remembers(type(term)) for term in terms)
+    )
+
+
+def remembers(term: type[Term]) -> bool:
+    """Whether a term of this class takes more than a step from one state to the next: memory, clocks, sensors."""
+    return term.structural or any(term.overrides(hook) for hook in BEYOND)
+
+
+BEYOND = ("start_law", "applied_torque", "initial_state", "read_out")
+"""Stages of such a term."""
+
+
+def _nominal(replay: SegmentReplay) -> FloatArray:
+    return np.array([p.nominal for p in replay.parameters])
+
+
+def _written(replay: SegmentReplay, values: FloatArray) -> BatchModel:
+    """The models of one candidate."""
+    return replay.batch(replay._values(values[None]), 1)
+
+
+def chain_of(replay: FloatingReplay) -> Chain:
+    """A walk with its states as they were reconstructed, and the weight shared out evenly among what touches."""
+    walk, base = replay.log, replay.base
+    assert base is not None
+    n = len(walk)
+    states = starts_at(base, np.stack([np.arange(n), np.arange(n) + 2], axis=1))
+    own = {f.name: getattr(replay, f.name) for f in fields(replay)} | {"effort": False}
+    steps = SampleSteps(**{**own, "segments": states.chosen(np.arange(n - 1))})
+    near = _touching(steps.model, walk, base)
+    touch = near[:-1] | near[1:]
+    share = touch / np.maximum(touch.sum(axis=1, keepdims=True), 1)
+    wrench = np.zeros((n - 1, touch.shape[1], 6))
+    wrench[:, :, 2] = base.size.weight * share
+    gyro = imu_columns(walk, ("gyro_x", "gyro_y", "gyro_z"))
+    up, up_std = vertical(walk, base.size, [])
+    joints = [walk.channels[f"position.{j}"] if walk.has("position", j) else np.full(n, np.nan) for j in base.joints]
+    measured = np.column_stack([*joints, gyro, up[:, :2]])
+    noise = np.array([noise_floor(c).sigma if np.isfinite(c).any() else np.inf for c in (*joints, *gyro.T)])
+    # a joint that stands still shows no noise, and is known no better than the others
+    noise[: len(joints)] = np.maximum(noise[: len(joints)], 0.5 * np.median(noise[: len(joints)]))
+    sigma = np.column_stack([np.tile(noise, (n, 1)), up_std, up_std])
+    sigma[~np.isfinite(measured) | ~base.usable[:, None]] = np.inf
+    return Chain(
+        steps=replace(steps, wrench=wrench),
+        states=states,
+        touch=touch,
+        linked=base.usable[:-1] & base.usable[1:],
+        measured=np.nan_to_num(measured),
+        sigma=sigma,
+        time=walk.time - walk.time[0],
+        size=base.size,
+    )
+
+
+def _touching(model: mujoco.MjModel, walk: Log, base: BaseState) -> BoolArray:
+    """Which feet may touch, (n, f): rather too often than too seldom, by a sample either way."""
+    feet = touching_bodies(model)
+    load = foot_loads(model, feet, walk, [])
+    low = lowest_points(model, feet, base)
+    above = low - low.min(axis=1, keepdims=True)
+    if load is None:
+        near = above < base.size.length(NEAR)
+    else:
+        near = (above < base.size.length(LOWEST_LOADED)) | (load > LIGHTEST * float(np.median(load.sum(axis=1))))
+    wide: BoolArray = near.copy()
+    wide[1:] |= near[:-1]
+    wide[:-1] |= near[1:]
+    return wide
+
+
+LOWEST_LOADED, LIGHTEST = 0.002, 0.01
+"""m above the lowest foot up to which one may touch whatever its force sensors say, and fraction of the weight on it
+beyond which it does."""
+
+
+def derive(chain: Chain, values: FloatArray) -> Derivatives:
+    """How the end of each step depends on its start and the forces in it, which hardly depends on the numbers."""
+    steps, d = _coarse(chain), chain.states.std.shape[1]
+    w, forces = len(chain.touch), chain.touch.shape[1] * 6
+    size = each_of(NUDGE, chain)
+    # without contact nothing depends on where the base is, and its velocity only adds to where it gets
+    lanes = np.array([3, 4, 5, 9, 10, 11, *range(BASE, d)])
+    nudges = np.zeros((1 + len(lanes) + forces, d + forces))
+    nudges[1 + np.arange(len(lanes)), lanes] = size[lanes]
+    kinds = chain.size.force(1.0) * np.tile([NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3, forces // 6)
+    nudges[1 + len(lanes) + np.arange(forces), d + np.arange(forces)] = kinds
+    count = len(nudges)
+    segment, lane = np.repeat(np.arange(w), count), np.tile(np.arange(count), w)
+    ends = steps.ends(values[None], np.zeros(w * count, dtype=np.int64), segment, nudges[lane])
+    first = np.arange(w) * count
+    change = difference(ends, ends.chosen(np.repeat(first, count))).reshape(w, count, d)
+    start = np.tile(np.eye(d), (w, 1, 1))
+    start[:, [0, 1, 2], [6, 7, 8]] = np.diff(chain.steps.log.time)[:, None]
+    start[:, :, lanes] = np.moveaxis(change[:, 1 : 1 + len(lanes)], 1, 2) / size[lanes]
+    mean = np.moveaxis(change[:, 1 + len(lanes) :], 1, 2) / kinds
+    on = np.repeat(chain.touch, 6, axis=1)[:, None]
+    blows = _blows(chain, values)
+    return Derivatives(start, mean * on, start @ blows[:-1] * on, blows[1:] * on)
+
+
+def _coarse(chain: Chain) -> SampleSteps:
+    step, steps = whole_step(float(chain.time[1]), chain.size.time(COARSE)), chain.steps
+    return replace(steps, numerics=replace(steps.numerics, integrator="RK4", timestep=step))
+
+
+def _blows(chain: Chain, values: FloatArray) -> FloatArray:
+    """Change of a state under unit blows (Ns, Nms) on its feet, (n, d, 6 f)."""
+    import mujoco
+
+    steps, states = chain.steps, chain.states
+    model, index = _written(steps, values).candidate(0), steps.index
+    data = mujoco.MjData(model)
+    place, motion = steps._free_joint
+    order = np.concatenate([motion + np.arange(6), index.dof])
+    joints = len(index.joints)
+    rows = np.concatenate([np.arange(6, BASE), BASE + joints + np.arange(joints)])
+    jacobian, blow = np.zeros((len(steps.feet), 6, model.nv)), np.zeros((6 * len(steps.feet), model.nv))
+    result = np.zeros((len(states), states.std.shape[1], len(blow)))
+    for k in range(len(states)):
+        data.qpos[place : place + 3] = states.free_base.position[k]
+        data.qpos[place + 3 : place + 7] = states.free_base.quaternion[k]
+        data.qpos[index.qpos] = states.joint_position[k]
+        mujoco.mj_fwdPosition(model, data)
+        for own, body in zip(jacobian, steps.feet, strict=True):
+            mujoco.mj_jacBodyCom(model, data, own[:3], own[3:], body)
+        mujoco.mj_solveM(model, data, blow, jacobian.reshape(blow.shape))
+        result[k, rows] = blow.T[order]
+    return result
+
+
+def difference(a: Segments, b: Segments) -> FloatArray:
+    """(w, d) change that takes states `b` to `a`, in the coordinates of `Segments.std`."""
+    there, here = a.free_base, b.free_base
+    turned, from_here = (to_rotation(base.quaternion) for base in (there, here))
+    return np.concatenate(
+        [
+            there.position - here.position,
+            (from_here.inv() * turned).as_rotvec(),
+            there.velocity - here.velocity,
+            there.rate - here.rate,
+            a.joint_position - b.joint_position,
+            a.joint_velocity - b.joint_velocity,
+        ],
+        axis=1,
+    )
+
+
+def simulate_chain(chain: Chain, values: FloatArray, free: IntArray, step: FloatArray) -> Ends:
+    """Replay every step of a chain under a candidate and its neighbours."""
+    steps, states, w = chain.steps, chain.states, len(chain.touch)
+    every = np.arange(w)
+    ends = steps.ends(values[None], np.zeros(w, dtype=np.int64), every, None)
+    candidates = np.tile(values, (1 + len(free), 1))
+    candidates[1 + np.arange(len(free)), free] += step
+    count = len(candidates)
+    row, segment = np.tile(np.arange(count), w), np.repeat(every, count)
+    coarse = _coarse(chain)
+    around = coarse.ends(candidates, row, segment, None)
+    plain = around.chosen(every * count)
+    by_number = difference(around, plain.chosen(segment)).reshape(w, count, -1)[:, 1:] / step[:, None]
+    late = replace(coarse, late=1).ends(values[None], np.zeros(w, dtype=np.int64), every, None)
+    by_time = difference(late, plain) / coarse.numerics.timestep
+    by_number = np.concatenate([by_number, by_time[:, None]], axis=1)
+    return Ends(difference(ends, states.chosen(1 + every)), np.moveaxis(by_number, 1, 2))
+
+
+def likeliest(chain: Chain, known: Derivatives, ends: Ends, slacks: Sequence[float] = (1.0,)) -> Chain:
+    """The chain with the slack, and then the size of jolts, that make its log likeliest."""
+
+    def surprise(tried: Chain) -> float:
+        found = linearise_chain(tried, known, ends)
+        # at the numbers that suit it best: those of the start may be far off
+        best = np.linalg.lstsq(found.left[:, 1:], found.left[:, 0], rcond=1e-9)[0]
+        return found.surprise - float(found.gradient @ best)
+
+    if len(slacks) > 1:
+        chain = min((replace(chain, slack=slack) for slack in slacks), key=surprise)
+    return min((replace(chain, jolt=jolt) for jolt in JOLTS), key=surprise)
+
+
+def linearise_chain(chain: Chain, known: Derivatives, ends: Ends) -> Round:
+    """Cost of a chain to second order in the free numbers, its states and forces at their best."""
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    (n, d), w, p = chain.states.std.shape, len(chain.touch), ends.by_number.shape[2]
+    right = np.concatenate(
+        [known.start, np.tile(np.eye(d), (w, 1, 1)), ends.by_number, ends.defect[:, :, None]], axis=2
+    )
+    linked = chain.linked[:, None, None]
+    right = np.where(linked, right, 0.0)
+    failed = Round(np.zeros((1, 1 + p)), np.zeros(1, dtype=np.int64), np.inf, np.zeros((n * d, 1 + p)), ends)
+    if not np.isfinite(right).all():  # a simulation failed
+        return failed
+    try:
+        factor = np.linalg.cholesky(np.where(linked, unexplained(chain, known)[2], np.eye(d)))
+        white = np.linalg.solve(factor, right)
+        before, after, sides = white[:, :, :d], -white[:, :, d : 2 * d], white[:, :, 2 * d :]
+        # what the candidate as it is leaves comes first, then a unit of each number
+        sides = np.roll(sides, 1, axis=2)
+        sight, seen = measurements(chain)
+        diagonal = sight.transpose(0, 2, 1) @ sight + np.diag(each_of(LOOSE, chain) ** -2.0)
+        diagonal[:-1] += before.transpose(0, 2, 1) @ before
+        diagonal[1:] += after.transpose(0, 2, 1) @ after
+        linear = np.zeros((n, d, 1 + p))
+        linear[:, :, 0] = np.einsum("nmd,nm->nd", sight, seen)
+        linear[:-1] += before.transpose(0, 2, 1) @ sides
+        linear[1:] += after.transpose(0, 2, 1) @ sides
+        band = cholesky_banded(_band(diagonal, after.transpose(0, 2, 1) @ before), lower=True)
+    except (np.linalg.LinAlgError, ValueError):
+        return failed
+    solved = cho_solve_banded((band, True), linear.reshape(n * d, 1 + p))
+    states = solved.reshape(n, d, 1 + p)
+    missed = sides - before @ states[:-1] - after @ states[1:]
+    stated = -sight @ states
+    stated[:, :, 0] += seen
+    kept = -states / each_of(LOOSE, chain)[:, None]
+    left = np.concatenate([part.reshape(-1, 1 + p) for part in (missed, stated, kept)])
+    volume = np.log(np.diagonal(factor, axis1=1, axis2=2))[chain.linked].sum() + np.log(band[0]).sum()
+    surprise = float(left[:, 0] @ left[:, 0]) + 2 * float(volume)
+    stretch = (chain.time / chain.size.time(BLOCK)).astype(np.int64)
+    blocks = np.concatenate([np.repeat(stretch[:w], d), np.repeat(stretch, stated.shape[1]), np.repeat(stretch, d)])
+    return Round(left, blocks, surprise, solved, ends)
+
+
+def unexplained(chain: Chain, known: Derivatives) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sizes of the unknown forces (18 f,), what one of its size does (w, d, 18 f), and the covariance of their sum."""
+    size = chain.size
+    kinds = np.tile([1.0] * 3 + [size.length(LEVER)] * 3, chain.touch.shape[1])
+    jolt = size.time(chain.jolt) * kinds
+    sizes = np.concatenate([STEADY * kinds, jolt, jolt]) * size.weight
+    forces = np.concatenate([known.mean, known.blow, known.last], axis=2) * sizes
+    return sizes, forces, forces @ forces.transpose(0, 2, 1) + np.diag((chain.slack * each_of(SLACK, chain)) ** 2)
+
+
+def each_of(kinds: Sequence[float], chain: Chain) -> FloatArray:
+    """(d,) one number for every coordinate of a state from a Nao's for every kind."""
+    joints = chain.states.joint_position.shape[1]
+    return np.repeat(chain.size.state(kinds), [3, 3, 3, 3, joints, joints])
+
+
+def measurements(chain: Chain) -> tuple[FloatArray, FloatArray]:
+    """Whitened derivatives (n, m, d) of what is measured by the states, and what they leave of it, (n, m)."""
+    states = chain.states
+    n, j = states.joint_position.shape
+    up = to_rotation(states.free_base.quaternion).as_matrix()[:, 2]
+    sight = np.zeros((n, j + 5, states.std.shape[1]))
+    sight[:, np.arange(j), BASE + np.arange(j)] = 1.0
+    sight[:, j + np.arange(3), 9 + np.arange(3)] = 1.0
+    # a small turn r of the base moves the vertical in its frame by up x r
+    sight[:, j + 3, 4], sight[:, j + 3, 5] = -up[:, 2], up[:, 1]
+    sight[:, j + 4, 3], sight[:, j + 4, 5] = up[:, 2], -up[:, 0]
+    left = np.concatenate([states.joint_position, states.free_base.rate, up[:, :2]], axis=1) - chain.measured
+    return sight / chain.sigma[:, :, None], left / chain.sigma
+
+
+def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
+    """Lower band (2 d, n d) of a symmetric matrix of blocks: (n, d, d), and (n - 1, d, d) below them."""
+    n, d, _ = diagonal.shape
+    band = np.zeros((2 * d, n * d))
+    at = np.arange(n)[:, None] * d
+    r, c = np.tril_indices(d)
+    band[r - c, at + c] = diagonal[:, r, c]
+    r, c = (g.ravel() for g in np.indices((d, d)))
+    band[d + r - c, at[:-1] + c] = below[:, r, c]
+    return band
+
+
+def moved_chain(chain: Chain, known: Derivatives, found: Round, change: FloatArray) -> Chain:
+    """A chain with its states, and the mean forces in its steps, where they are best after a change of the numbers."""
+    n, d = chain.states.std.shape
+    move = -(found.move[:, 0] + found.move[:, 1:] @ change).reshape(n, d)
+    rest = found.ends.defect + np.einsum("nij,nj->ni", known.start, move[:-1]) - move[1:]
+    rest = rest + found.ends.by_number @ change
+    # least-norm forces, each in its own size, that explain what the steps leave open
+    sizes, forces, total = unexplained(chain, known)
+    linked = chain.linked[:, None, None]
+    forces, total = np.where(linked, forces, 0.0), np.where(linked, total, np.eye(d))
+    rest = np.where(linked[:, :, 0], rest, 0.0)
+    pushed = -np.einsum("ndm,nd->nm", forces, np.linalg.solve(total, rest[:, :, None])[:, :, 0]) * sizes
+    wrench = chain.steps.wrench
+    assert wrench is not None
+    mean = pushed[:, : wrench[0].size].reshape(wrench.shape)
+    states = chain.states.moved(move)
+    steps = replace(chain.steps, segments=states.chosen(np.arange(n - 1)), wrench=wrench + mean)
+    return replace(chain, steps=steps, states=states)

@@ -1,0 +1,199 @@
+"""Walks compared sample by sample with what those before it lead one to expect."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from test_contact_free import random_states
+from walks import heavier, record_walk
+
+import sysid_btr as sb
+from benchmarks import ground
+from sysid_btr.errors import UsageError
+from sysid_btr.floating_base import chain as chain_module
+from sysid_btr.floating_base import innovations
+from sysid_btr.floating_base.chain import Chain, Derivatives
+from sysid_btr.floating_base.episode import FloatingEpisode
+from sysid_btr.floating_base.innovations import Innovations, InnovationsEpisode, kalman_filter
+from sysid_btr.floating_base.size import NAO
+from sysid_btr.identify.fit import Fit, fit
+from sysid_btr.identify.mode import Mode
+from sysid_btr.identify.study import Study, make_study
+from sysid_btr.io.log import Log
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.gait import Gait
+from sysid_btr.objectives.problem import ReplayProblem
+
+
+def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    n, joints, feet = 5, 2, 1
+    states = random_states(n, joints, rng)
+    d, w = states.std.shape[1], n - 1
+    linked = np.array([True, True, False, True])
+    chain = Chain(
+        steps=cast(Any, None),
+        states=states,
+        touch=np.ones((w, feet), dtype=bool),
+        linked=linked,
+        measured=rng.normal(size=(n, joints + 5)),
+        sigma=np.where(rng.random((n, joints + 5)) < 0.2, np.inf, 0.5),
+        time=np.arange(n) * 0.02,
+        size=replace(NAO, weight=0.01),
+    )
+    shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3]
+    known = Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
+    keep = np.setdiff1d(np.arange(d), innovations.BLIND)
+    sight = chain_module.measurements(chain)[0]
+    total = chain_module.unexplained(chain, known)[2][:, keep][:, :, keep]
+    prior = chain_module.each_of(chain_module.LOOSE, chain)[keep]
+
+    def shown(start: np.ndarray, moved: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Innovations of states and measurements that are off by so many of their standard deviations."""
+        error, seen = prior * start[0], []
+        for k in range(n):
+            seen.append(-(sight[k][:, keep] @ error + noise[k]))
+            if k < w and linked[k]:
+                error = known.start[k][np.ix_(keep, keep)] @ error + np.linalg.cholesky(total[k]) @ moved[k]
+            elif k < w:
+                error = prior * start[1]
+        monkeypatch.setattr(innovations, "measurements", lambda _: (sight, np.array(seen)))
+        own = kalman_filter(chain, known, np.zeros((w, d)))
+        return own.innovations(np.zeros((1, w, len(keep)))).ravel()
+
+    sizes = [(2, len(keep)), (w, len(keep)), (n, joints + 5)]
+    count = sum(a * b for a, b in sizes)
+    columns = []
+    for unit in np.eye(count):
+        parts = np.split(unit, np.cumsum([a * b for a, b in sizes])[:-1])
+        columns.append(shown(*(part.reshape(size) for part, size in zip(parts, sizes, strict=True))))
+    by_noise = np.column_stack(columns)
+    np.testing.assert_allclose(by_noise @ by_noise.T, np.eye(n * joints), atol=1e-7)
+
+
+@cache
+def walk(delay: float = 0.0) -> Log:
+    return record_walk(Gait(), 6.0, edit=heavier("LKneePitch", 1.4), delay=delay)[0]
+
+
+@cache
+def study(delay: float = 0.0) -> Study:
+    return make_study(load_robot("nao"), [walk(delay)], threads=2)
+
+
+@cache
+def found() -> Fit:
+    return fit(study(), ["mass:LKneePitch,RKneePitch", "kp:*=shared"])
+
+
+def test_a_walk_is_compared_by_its_innovations() -> None:
+    fitted, held = study().train[0], study().holdout[0]
+    assert isinstance(fitted, InnovationsEpisode)
+    assert isinstance(held, InnovationsEpisode)
+    assert not np.any(fitted.compared & held.compared[: len(fitted.log)])
+    facts = fitted.facts()
+    assert (facts["mode"], facts["why"]) == ("innovations", "its base floats")
+    assert facts["samples"] == fitted.compared.sum() > 0
+
+
+def test_masses_and_gains_lie_within_their_intervals_and_only_noise_is_left() -> None:
+    truth = {"mass:LKneePitch": 1.4, "mass:RKneePitch": 1.0, "kp:*": 1.0}
+    for estimate in found().estimates:
+        assert abs(estimate.value - truth[estimate.name]) < 2.5 * estimate.std, estimate
+        assert estimate.std < 0.1
+    columns = study().train_problem(found().study.declare(["mass:LKneePitch,RKneePitch", "kp:*=shared"]))
+    chi2 = columns.column_chi2(columns.residuals(found().optimum[None])[0])
+    assert 0.5 < np.median(chi2) < 1.2
+    assert chi2.max() < 1.7
+    assert found().misfit is None
+
+
+@pytest.mark.slow
+def test_masses_are_right_on_a_ground_that_the_model_does_not_know() -> None:
+    walker = ground.draw(5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ground, "SECONDS", 6.0)
+        log = ground.record(walker)
+    assert log is not None
+    freed = ["mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"]
+    told = fit(make_study(load_robot("nao"), [log], threads=2), freed)
+    truth = {f"mass:{name}": factor for name, factor in walker.masses.items()} | {"kp:*": walker.kp, "kv:*": walker.kv}
+    error = np.array([(e.value - truth[e.name]) / e.std for e in told.estimates])
+    assert np.abs(error).max() < 3.5, dict(zip((e.name for e in told.estimates), error, strict=True))
+    assert np.sqrt(np.mean(error**2)) < 1.6
+
+
+@pytest.mark.slow
+def test_masses_of_a_walk_in_another_engine_lie_within_their_intervals(shared_data: Path) -> None:
+    log = sb.read_log(shared_data / "nao_walk_soles" / "logs" / "soles_a.parquet")
+    part = log.window(0, int(np.searchsorted(log.time, log.time[0] + 9.0)))
+    told = fit(make_study(load_robot("nao"), [part], threads=2), ["mass:*HipPitch,*KneePitch", "kp:*=shared"])
+    truth = {
+        "mass:RHipPitch": 1.2,
+        "mass:LHipPitch": 1.25,
+        "mass:RKneePitch": 0.85,
+        "mass:LKneePitch": 0.8,
+        "kp:*": 1.0,
+    }
+    for estimate in told.estimates:
+        assert abs(estimate.value - truth[estimate.name]) < 3 * estimate.std, estimate
+        assert estimate.std < 0.1
+
+
+@pytest.mark.slow
+def test_a_delay_is_named_with_its_amount_and_nothing_on_a_clean_walk() -> None:
+    effects, freed = ["command_delay", "coulomb_friction"], ["mass:LKneePitch,RKneePitch", "kp:*=shared"]
+    late = sb.close(study(0.03), freed, effects=effects)
+    assert late.verdict == "explained"
+    (delay,) = (e for e in late.estimates if e.name.startswith("command_delay"))
+    assert delay.value == pytest.approx(0.03, abs=0.0015)
+    assert next(e.value for e in late.estimates if e.name == "mass:LKneePitch") == pytest.approx(1.4, abs=0.15)
+    assert sb.close(study(), freed, effects=effects).verdict == "nothing_missing"
+
+
+def test_a_candidate_has_the_same_bits_whatever_is_beside_it_and_in_another_process() -> None:
+    problem = study().train_problem(study().declare(["mass:LKneePitch", "kp:*=shared"]))
+    assert isinstance(problem.episodes[0], Innovations)
+    candidates = np.array([[0.8, 1.0], [1.3, 0.9], [1.0, 1.1]])
+    together = problem.residuals(candidates)
+    assert np.array_equal(problem.residuals(candidates[1:2])[0], together[1])
+    elsewhere: ReplayProblem = pickle.loads(pickle.dumps(problem))
+    assert np.array_equal(elsewhere._residuals(candidates), together)
+
+
+def test_fewer_seconds_are_those_that_move_most() -> None:
+    (whole,) = study().train
+    assert isinstance(whole, InnovationsEpisode)
+    short = whole.shortened(1.0)
+    assert 0.9 < short.log.time[-1] - short.log.time[0] - innovations.SETTLING < 1.1
+    plain = replace(study(), train=(short,)).train_problem(())
+    assert 0 < plain.count < study().train_problem(()).count
+    # the filter of a part is the filter: once its beginning is forgotten it shows the same
+    start = int(np.searchsorted(whole.log.time, short.log.time[0]))
+    ours, all_of_it = (p.residuals(np.zeros((1, 0)))[0].reshape(-1, 22) for p in (plain, study().train_problem(())))
+    first = int(np.argmax(short.compared)) + start - int(np.argmax(whole.compared))
+    np.testing.assert_allclose(ours[-10:], all_of_it[first : first + len(ours)][-10:], atol=0.3)
+
+
+def test_what_needs_the_ground_or_a_past_is_refused_with_the_way_out() -> None:
+    for expression in ("foot_compliance:*AnkleRoll=shared", "backlash:LKneePitch"):
+        with pytest.raises(UsageError, match="--mode segments"):
+            study().declare([expression])
+
+
+def test_a_walk_that_does_not_suit_is_replayed_by_segments() -> None:
+    log = walk()
+    time = log.time.copy()
+    time[1::2] += 0.003
+    uneven = replace(log, time=time)
+    assert isinstance(make_study(load_robot("nao"), [uneven], threads=2).train[0], FloatingEpisode)
+    with pytest.raises(UsageError, match="equal intervals"):
+        make_study(load_robot("nao"), [uneven], mode=Mode("innovations"), threads=2)
+    with pytest.raises(UsageError, match="--mode segments"):
+        make_study(load_robot("nao"), [log], mode=Mode("inverse"), threads=2)
