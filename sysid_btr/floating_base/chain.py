@@ -58,6 +58,8 @@ NUDGE_NUMBER = 0.02
 LATE = 0.001
 """s, standard deviation of what sensors and commands may be apart in time beyond the model: a tick of a loop at 1 kHz.
 A gain and a fraction of a millisecond look much alike. Of the bus, whatever the size of the robot."""
+TOGETHER = 256
+"""Steps whose derivatives are taken together: memory stays bounded whatever the length of the log."""
 LEAST = 50
 """Samples that a walk must have."""
 
@@ -334,10 +336,13 @@ def derive(chain: Chain, values: FloatArray) -> Derivatives:
     kinds = chain.size.force(1.0) * np.tile([NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3, forces // 6)
     nudges[1 + len(lanes) + np.arange(forces), d + np.arange(forces)] = kinds
     count = len(nudges)
-    segment, lane = np.repeat(np.arange(w), count), np.tile(np.arange(count), w)
-    ends = steps.ends(values[None], np.zeros(w * count, dtype=np.int64), segment, nudges[lane])
-    first = np.arange(w) * count
-    change = difference(ends, ends.chosen(np.repeat(first, count))).reshape(w, count, d)
+    change = np.empty((w, count, d))
+    for first in range(0, w, TOGETHER):
+        own = np.arange(first, min(first + TOGETHER, w))
+        segment, lane = np.repeat(own, count), np.tile(np.arange(count), len(own))
+        ends = steps.ends(values[None], np.zeros(len(segment), dtype=np.int64), segment, nudges[lane])
+        plain = np.repeat(np.arange(len(own)) * count, count)
+        change[own] = difference(ends, ends.chosen(plain)).reshape(len(own), count, d)
     start = np.tile(np.eye(d), (w, 1, 1))
     start[:, [0, 1, 2], [6, 7, 8]] = np.diff(chain.steps.log.time)[:, None]
     start[:, :, lanes] = np.moveaxis(change[:, 1 : 1 + len(lanes)], 1, 2) / size[lanes]

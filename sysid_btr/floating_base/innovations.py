@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.errors import LogError
+from sysid_btr.errors import LogError, ModelError
 from sysid_btr.floating_base.chain import (
     COARSE,
     LATE,
@@ -410,6 +410,12 @@ class InnovationsEpisode(Episode):
             replay = FloatingReplay(robot, self.recording, tuple(terms), numerics, threads=threads, base=self.base)
             chain = replace(chain_of(replay), slack=SLACKS[-1])
             known = derive(chain, terms.nominal)
+            if not np.isfinite(known.start).all():
+                raise ModelError(
+                    f"model {self.robot.name}: it diverges within a sample of {self.recording.path or 'the log'}, from "
+                    f"states as measured, with steps of {1e3 * numerics.timestep:.3g} ms. Check armature and masses: a "
+                    "body without mass is the usual cause."
+                )
             chain, own = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
             return chain, known, own
 
