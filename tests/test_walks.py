@@ -45,7 +45,8 @@ from sysid_btr.terms.inertial import GravityTilt
 from sysid_btr.terms.servo import CommandDelay
 
 FINE = Numerics("RK4", 0.001)
-WINDOWS = Mode("segments")
+WINDOWS = Mode("forward")
+"""Walks by segments on the model's ground, and what hangs whole."""
 LENGTH = 10
 
 

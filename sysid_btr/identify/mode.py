@@ -139,7 +139,7 @@ def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
         return "innovations", "as asked for"
     if mode.asked == AUTO:
         return ("innovations", "its base floats") if suited else ("floating", "its base floats")
-    if mode.asked == "segments" and not mode.seconds > 0:
+    if mode.asked == "forward" or (mode.asked == "segments" and not mode.seconds > 0):
         return "floating", "as asked for"
     raise UsageError(
         f"--mode {mode.asked}{f', --segments {mode.segments}' if mode.seconds > 0 else ''}: {log.path or 'the log'} is "
