@@ -28,7 +28,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
-from sysid_btr.objectives.covariance import covariance
+from sysid_btr.objectives.covariance import Scatter, covariance
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Parameter
@@ -193,6 +193,14 @@ def test_covariance_is_infinite_where_nothing_is_seen() -> None:
     found = np.diag(covariance(jacobian, rng.standard_normal(400), np.arange(400) // 10))
     assert np.isinf(found[2])
     assert np.all(np.isfinite(found[:2]))
+
+
+def test_degrees_of_freedom_are_no_more_than_there_are_stretches_even_where_nothing_is_seen() -> None:
+    known = Scatter(np.eye(2), np.eye(2), common=1.0, shrinkage=0.0, information=np.tile(np.eye(2) / 8, (8, 1, 1)))
+    np.testing.assert_allclose(known.degrees_of_freedom(np.array([[1.0, 0.0], [0.6, 0.8]])), 7)
+    assert known.degrees_of_freedom(np.zeros((1, 2))) <= 8
+    averaged = Scatter(np.eye(2), np.eye(2), common=3.0, shrinkage=0.5, information=known.information)
+    assert averaged.degrees_of_freedom(np.zeros((1, 2))) <= 8 * 2
 
 
 def test_covariance_is_infinite_for_two_parameters_that_do_the_same() -> None:

@@ -80,9 +80,10 @@ class Scatter:
     def degrees_of_freedom(self, directions: FloatArray) -> FloatArray:
         """Of the variance in some directions (p, k) (Satterthwaite 1946, doi:10.2307/3002019)."""
         unit = directions / np.maximum(np.linalg.norm(directions, axis=1), np.finfo(float).tiny)[:, None]
-        # a stretch that holds most of the information counts for most of the stretches
+        # a stretch that holds most of the information counts for most of the stretches; shares add up to one, but for
+        # directions of length zero, of which there are as many stretches as there are
         share = np.einsum("pk,gkl,pl->pg", unit, self.information, unit)
-        stretches = np.maximum(1 / np.maximum(np.sum(share**2, axis=1), np.finfo(float).tiny) - 1, 1.0)
+        stretches = np.maximum(1 / np.maximum(np.sum(share**2, axis=1), 1 / len(self.information)) - 1, 1.0)
         own = (1 - self.shrinkage) * np.einsum("pk,kl,pl->p", unit, self.raw, unit)
         common = self.shrinkage * self.common
         spread = (own**2 + common**2 / max(len(self.matrix), 1)) / stretches
