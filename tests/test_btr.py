@@ -646,6 +646,22 @@ def test_disengagement_is_found_and_said() -> None:
     assert disengaged(rounds([1, 1, 1, 2], lambda e: -e)) == ""
 
 
+def test_a_gait_that_fell_is_the_best_only_where_none_stood() -> None:
+    fast = Tried(1, Controller(np.zeros(1)), 0.0, Trial(None, 2.0, "fallen"))
+    slow = Tried(1, Controller(np.ones(1)), 0.0, Trial(None, 0.5))
+    assert TrialBook(made=[fast]).best is fast
+    assert TrialBook(made=[fast, slow, fast]).best is slow
+    assert TrialBook(made=[slow, replace(slow)]).best is slow
+
+
+@pytest.mark.parametrize(("learn", "words"), [(True, "after correction of"), (False, "in the model as it is")])
+def test_a_model_that_stays_is_not_said_to_be_corrected(learn: bool, words: str) -> None:
+    said: list[str] = []
+    tiny(hidden(), settings=replace(TINY, iterations=1, learn=learn), say=said.append)
+    assert words in said[-1]
+    assert ("correct" in said[-1]) is learn
+
+
 def test_a_damaged_trial_is_not_passed_over(tmp_path: Path) -> None:
     book = TrialBook(tmp_path)
     values = SPACE.start

@@ -514,11 +514,12 @@ def _told(t: Tried, foreseen: Foreseen) -> str:
 
 def _line(r: Iteration) -> str:
     fell = sum(t.trial.outcome != "done" for t in r.tried)
+    model = "after correction of the model" if np.isfinite(r.loss) else "in the model as it is"
     parts = [
         f"iteration {r.number}: {len(r.tried)} trials" + (f" ({fell} fell or crashed)" if fell else ""),
         f"best on the robot {r.best:.4g} m/s",
         f"expected {r.expected:.4g}",
-        f"fitness differs by {r.transfer:.2g} before, {r.delta:.2g} after correction of the model",
+        f"fitness differs by {r.transfer:.2g} from what was foreseen, by {r.delta:.2g} {model}",
     ]
     if r.promise is not None:
         parts.append(f"a trial promised {r.promise:.2g} m/s")

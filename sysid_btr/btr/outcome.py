@@ -41,7 +41,7 @@ class Iteration:
     population_names : of their parameters, before `close` added to them.
     delta : mean absolute difference of fitness between this model and the robot on the trials of this iteration.
     noise : position error of this model in noise floors on them; NaN where nothing was logged.
-    best : largest real fitness so far.
+    best : largest real fitness so far of a trial that stood; of any where none did.
     joined : what `close` said, if it ran.
     promise : what the first trial was worth beforehand, m/s: the gain to be expected, times the chance to stand; None
         where one model chose. Nothing is tried where that is less than is worthwhile.
@@ -78,7 +78,7 @@ class BackToReality:
     ----------
     stage, model : the best model: what runs it, and its numbers (q,).
     iterations : all rounds.
-    best : the fittest controller on the robot.
+    best : the fittest controller on the robot, of those that stood if any did.
     reason : why it ended, a sentence.
     finished : whether it ended because the requirement was met or the iterations done.
     settings, seed : as given.

@@ -61,8 +61,8 @@ class TrialBook:
 
     @property
     def best(self) -> Tried | None:
-        """The fittest of all; of equals the first."""
-        return max(self.made, key=lambda t: t.trial.fitness, default=None)
+        """The fittest of those that stood, of all only where none did; of equals the first."""
+        return max(self.made, key=lambda t: (t.trial.outcome == "done", t.trial.fitness), default=None)
 
     def of(self, iteration: int) -> list[Tried]:
         """The trials of one iteration."""
