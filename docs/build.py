@@ -33,6 +33,7 @@ TITLES = {
     "index": "Overview",
     "robot_and_log": "Your robot and your log",
     "verdicts": "What each verdict means",
+    "reports": "The reports",
     "effects": "Effects",
     "result": "result.json",
     "machines": "Many machines",

@@ -17,6 +17,7 @@ from sysid_btr.errors import UsageError
 RESULT = "result.json"
 OVERLAY = "overlay.png"
 REPORT = "report.html"
+EXPLORER, SERIES = "explore.html", "explore.json.gz"
 JOURNAL = "journal.jsonl"
 MODEL = "model.xml"
 PARAMS = "params.json"
@@ -127,7 +128,7 @@ class Folder:
     @property
     def held(self) -> tuple[str, ...]:
         """Names of what an earlier run left here."""
-        return tuple(n for n in (RESULT, REPORT, OVERLAY, JOURNAL, MODEL, PARAMS) if (self.path / n).exists())
+        return tuple(n for n in (RESULT, REPORT, EXPLORER, OVERLAY, JOURNAL, MODEL, PARAMS) if (self.path / n).exists())
 
     def within(self, name: str) -> Folder:
         """A folder in this one, made if it is missing.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 def save(
     outcome: Fit | Closing | Posterior, out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False
 ) -> Path:
-    """Write result.json, model.xml, params.json, overlay.png and report.html of a fit or a closing, as the command
+    """Write result.json, model.xml, params.json, pictures, report.html and explore.html of an outcome, as the command
     line does.
 
     Parameters
@@ -73,7 +74,9 @@ def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[s
     The result is given what the model became, and what was drawn.
     """
     from sysid_btr.posterior.outcome import Posterior
+    from sysid_btr.report.explore import explorable
     from sysid_btr.report.pictures import pictures_of, write_pages
+    from sysid_btr.report.traces import play
     from sysid_btr.writeback.write import describe_model
 
     if isinstance(outcome, Posterior):
@@ -81,7 +84,8 @@ def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[s
 
         folder.write(DRAWS, netcdf(outcome))
     describe_model(as_model(outcome), result, folder)
-    return write_pages(folder, result, pictures_of(outcome))
+    played = cache(lambda: play(as_model(outcome)))
+    return write_pages(folder, result, pictures_of(outcome, played), lambda: explorable(played()))
 
 
 def save_motion(folder: Folder, design: Design, result: dict[str, Any]) -> Path:

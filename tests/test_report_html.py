@@ -23,10 +23,11 @@ from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
-from sysid_btr.report.figures import correlate, plot_convergence, plot_overlay, plot_residuals, trace_outcome
+from sysid_btr.report.figures import correlate, plot_convergence, plot_overlay, plot_residuals
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.pictures import write_pages
 from sysid_btr.report.style import DARK, LIGHT, ink, new_figure, page
+from sysid_btr.report.traces import trace_outcome
 from sysid_btr.result import read_result
 from sysid_btr.run_folder import Folder
 

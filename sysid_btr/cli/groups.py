@@ -221,8 +221,8 @@ class OutOptions(RunOptions):
 
     out: Path | None = option(
         None,
-        "Folder for result.json, model.xml, params.json, overlay.png, report.html and the journal. Without it nothing "
-        "is written: results are only printed.",
+        "Folder for result.json, model.xml, params.json, report.html, explore.html, pictures and the journal. Without "
+        "it nothing is written: results are only printed.",
         short="-o",
         metavar="DIR",
         decides=False,

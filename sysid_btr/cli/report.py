@@ -18,7 +18,7 @@ class ReportOptions(Options):
 
 
 def report(options: ReportOptions) -> int:
-    """Write report.html again from result.json and the pictures of a finished run of any verb."""
+    """Write report.html and explore.html again from result.json, pictures and series of a finished run of any verb."""
     from jinja2 import TemplateError
 
     from sysid_btr.report.pictures import write_report

@@ -14,6 +14,7 @@ from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.nuisance import error_of_the_rest
 from sysid_btr.identify.refit import judge, refit
+from sysid_btr.identify.sensitivity import with_sensitivity
 from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
 
 
@@ -43,7 +44,7 @@ def with_intervals(state: State, rules: Selection) -> State:
             jacobian = np.nan_to_num(jacobian)
         else:  # what half the step changes in the derivatives is far less than what is known of them
             residual = problem.residuals(model.values[None])[0]
-        shift, known = numerics_shift(problem, model.values, jacobian, residual), None
+        slopes, shift, known = jacobian, numerics_shift(problem, model.values, jacobian, residual), None
         rest = error_of_the_rest(study, model, jacobian)
         fused = study.fuse(problem, model.values, jacobian, residual)
         if fused is not None:
@@ -61,6 +62,7 @@ def with_intervals(state: State, rules: Selection) -> State:
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, model, iterations=4))
     values, found, _ = fix_unidentifiable(problem, model.values, found, jacobian, known)
+    found = with_sensitivity(found, problem, slopes)
     last = judge(study, model.at(values))
     fitted = last if known is None else state.fitted
     return replace(state, study=study, fitted=fitted, estimates=found, reported=last)

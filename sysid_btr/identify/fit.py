@@ -24,6 +24,7 @@ from sysid_btr.identify.intervals import Estimate, Profile, estimates
 from sysid_btr.identify.nuisance import assumptions, check_nuisance, error_of_the_rest
 from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Misfit, Scores, misfit_of, score
+from sysid_btr.identify.sensitivity import with_sensitivity
 from sysid_btr.identify.step_check import Optimum, with_short_steps
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
@@ -126,6 +127,7 @@ class Fit(StudyOutcome):
             "effects": [],
             "candidates": [],
             "steps": [],
+            "history": [{"replays": done, "loss": loss} for done, loss in self.result.history],
             "signature": None,
             **assumptions(self.study, self.model.terms),
             **({"profiles": [p.to_dict() for p in self.profiles]} if self.profiles else {}),
@@ -208,7 +210,7 @@ def fit(
     return Fit(
         study=study,
         model=model.at(values),
-        estimates=found,
+        estimates=with_sensitivity(found, at.problem, at.jacobian),
         nominal=score(study, Model.of(terms)),
         before=before,
         result=solved.result,

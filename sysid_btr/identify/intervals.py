@@ -5,7 +5,7 @@ The covariance is that of `objectives.covariance`, widened by what halving the s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -18,6 +18,8 @@ from sysid_btr.terms.base import Parameter
 Identifiable = Literal["yes", "weak", "no"]
 NOT_IDENTIFIABLE = 0.15
 """Standard error, as a fraction of the range of the bounds, beyond which a log says nothing."""
+TOGETHER = ("correlation", "change", "moves")
+"""Of an estimate, what results have in ``correlation`` and ``sensitivity``."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Estimate:
     std_if_right : standard error if the model were right, where `std` and `ci95` hold for what it lacks too; else None.
     correlation : of its error with that of each parameter estimated beside it, itself included, in their order; NaN
         where nothing is known. Empty where it was not worked out.
+    change, moves : a change of it that matters, and by how many noise floors (root mean square) this moves each sensor
+        (``position.knee``), all other parameters fixed. Empty where it was not worked out.
     """
 
     name: str
@@ -48,10 +52,12 @@ class Estimate:
     reason: str
     std_if_right: float | None = None
     correlation: tuple[float, ...] = field(default=(), repr=False, compare=False)
+    change: float = field(default=0.0, repr=False, compare=False)
+    moves: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """As results have it; they have the correlations of all parameters in one matrix."""
-        return {name: value for name, value in asdict(self).items() if name != "correlation"}
+        """As results have it; what is said of all parameters together they have in matrices of their own."""
+        return {name: value for name, value in asdict(self).items() if name not in TOGETHER}
 
 
 def correlations(covariance: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from sysid_btr.identify.curves import curves_of
 from sysid_btr.identify.intervals import Estimate, correlation_matrix, covariance_matrix
 from sysid_btr.identify.residuals import residuals
 from sysid_btr.identify.scores import ChannelScore, Scores
+from sysid_btr.identify.sensitivity import sensitivity_table
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
 from sysid_btr.result import SCHEMA, clean, versions
@@ -80,6 +81,7 @@ class StudyOutcome:
         more = {
             "covariance": self.covariance,
             "correlation": self.correlation,
+            "sensitivity": list(sensitivity_table(self.estimates)),
             "curves": [curve.to_dict() for curve in curves_of(self.model, self.estimates)],
         }
         return study_result(self.study, {**self.found, **more}, seed=seed, replays=self.replays, wall_s=wall_s)

@@ -15,6 +15,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import Estimate, correlations, identifiability
 from sysid_btr.identify.scores import score
+from sysid_btr.identify.sensitivity import with_sensitivity
 from sysid_btr.posterior.likelihood import make_likelihood, settle
 from sysid_btr.posterior.outcome import Posterior
 from sysid_btr.posterior.predictive import coverage, predict_bands
@@ -91,7 +92,7 @@ def posterior(
         priors=chosen,
         likelihood=likelihood,
         sample=drawn,
-        estimates=_estimates(fit, drawn, jacobian),
+        estimates=with_sensitivity(_estimates(fit, drawn, jacobian), problem, jacobian),
         values=values,
         after=score(fit.study, fit.model.at(values)),
         bands=bands,

@@ -2,126 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.mujoco_conventions import slides
-from sysid_btr.report.style import FOUND, MODEL_COLOURS, PLAIN, SHADE, faint, ink, new_figure
-from sysid_btr.terms.model import Model
-from sysid_btr.units import CHANNEL_UNITS, si_all
+from sysid_btr._typing import FloatArray
+from sysid_btr.report.style import FOUND, SHADE, faint, ink, model_colours, new_figure
+from sysid_btr.report.traces import Trace
+from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
-    from sysid_btr.identify.study import Study
 
 
-JOINTS_SHOWN = 3
-EPISODES_SEARCHED = 8
 ZOOM_SECONDS = 2.0
 MOST_POINTS = 4000
 """Points of a line; more cannot be seen on a page."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """One joint in one episode.
-
-    Attributes
-    ----------
-    joint : name, with the log's where there are several.
-    channel : what is compared.
-    unit : of what is compared.
-    time : (n,) s since the first sample.
-    command, measured : (n,) NaN where missing; the command is a position whatever is compared.
-    predicted : name of the model -> (n,), from the plain model to the final one.
-    split : (s) held out from here on.
-    noise : noise floor of the sensor.
-    """
-
-    joint: str
-    channel: str
-    unit: str
-    time: FloatArray
-    command: FloatArray
-    measured: FloatArray
-    predicted: Mapping[str, FloatArray]
-    split: float
-    noise: float
-
-    @property
-    def held_out(self) -> BoolArray:
-        """(n,) samples from the split on."""
-        return np.asarray(self.time >= self.split)
-
-    def residual(self, name: str) -> FloatArray:
-        """(m,) log minus model on the held-out part; NaN where nothing was measured."""
-        return np.asarray((self.measured - self.predicted[name])[self.held_out])
-
-    def error(self, name: str) -> float:
-        """Root-mean-square error of one model on the held-out part, in noise floors."""
-        residual = self.residual(name)
-        residual = residual[np.isfinite(residual)]
-        return float(np.sqrt(np.mean(residual**2)) / self.noise) if len(residual) else 0.0
-
-
-Named = tuple[str, Model]
-"""A model to draw, and what it is called."""
-
-
-def trace_outcome(outcome: Fit | Closing) -> tuple[Trace, ...]:
-    """The worst joints of a fit or a closing, worst first.
-
-    They are those where the plain model is farthest off on held-out data, in noise floors; in a closing
-    those where the fitted parameters still are.
-    """
-    from sysid_btr.identify.fit import Fit
-
-    if isinstance(outcome, Fit):
-        models: tuple[Named, ...] = (("plain model", Model.of(outcome.model.terms)), ("fitted", outcome.model))
-        return trace(outcome.study, models, "plain model")
-    models = (("plain model", Model.of(())), ("parameters fitted", outcome.before_model))
-    if outcome.effects:
-        models = (*models, ("effects added", outcome.model))
-    return trace(outcome.study, models, "parameters fitted")
-
-
-def trace(study: Study, models: Sequence[Named], rank_by: str) -> tuple[Trace, ...]:
-    """Replay the held-out episodes under each model; the joints where model `rank_by` is worst."""
-    traces: list[Trace] = []
-    several = len(study.holdout) > 1
-    count = min(len(study.holdout), EPISODES_SEARCHED)
-    predicted: list[dict[str, FloatArray]] = [{} for _ in range(count)]
-    for name, model in models:
-        for i, episode in enumerate(study.holdout_problem(model).episodes[:count]):
-            predicted[i][name] = episode.targets[0].predicted(episode.replay.predict(model.values[None]))[0]
-    plain = study.holdout_problem(())
-    for i, episode in enumerate(plain.episodes[:count]):
-        log, target = study.holdout[i].log, episode.targets[0]
-        label = f" ({log.path.stem})" if several and log.path is not None else ""
-        for k, joint in enumerate(target.joints):
-            traces.append(
-                Trace(
-                    joint=joint + label,
-                    channel=target.channel,
-                    unit=CHANNEL_UNITS[target.channel][slides(episode.replay.model, joint)],
-                    time=log.time - log.time[0],
-                    command=log.channels.get(f"command.{joint}", np.full(len(log), np.nan)),
-                    measured=target.measured[:, k],
-                    predicted={name: p[:, k] for name, p in predicted[i].items()},
-                    split=study.holdout[i].begin,
-                    noise=float(target.noise[k]),
-                )
-            )
-    traces.sort(key=lambda t: -t.error(rank_by))
-    return tuple(traces[:JOINTS_SHOWN])
 
 
 def plot_overlay(traces: Sequence[Trace], figure: Figure | None = None) -> Any:
@@ -282,8 +182,7 @@ def _draw_lines(axis: Axes, item: Trace, begin: float, end: float) -> None:
 
 def _coloured(item: Trace) -> list[tuple[str, str]]:
     names = list(item.predicted)
-    colours = (PLAIN, FOUND) if len(names) == 2 else MODEL_COLOURS
-    return list(zip(names, colours, strict=False))
+    return list(zip(names, model_colours(len(names)), strict=False))
 
 
 def _milli(item: Trace) -> tuple[float, str]:

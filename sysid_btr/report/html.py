@@ -25,11 +25,10 @@ from sysid_btr.display.text import (
 from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
-    from jinja2 import Template
+    from jinja2 import Environment
 
 LARGEST, LARGEST_RAW = 4_000_000, 500_000
 """Characters of a page's pictures, and of result.json in it; the whole stays below 5 MB."""
-TEMPLATE = Path(__file__).with_name("report.html.j2")
 VERDICTS = {
     "explained": "The log shows effects that the model lacks, and they are named below.",
     "partly_explained": "The log shows effects that the model lacks, named below, and something more.",
@@ -55,7 +54,7 @@ class Picture:
     dark: bytes | None = None
 
 
-def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
+def render(result: Mapping[str, Any], pictures: Sequence[Picture] = (), explorer: str | None = None) -> str:
     """The report of a result: one HTML page that needs nothing else.
 
     Parameters
@@ -63,23 +62,29 @@ def render(result: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
     result : content of result.json.
     pictures : in the order in which they are shown. The first comes after the table of errors, the others at the
         end; where the page would grow beyond `LARGEST`, those for dark pages are left out, then the last ones.
+    explorer : name of the page to explore, if there is one.
     """
     shown, left_out = _fitting(pictures)
     raw = json.dumps(result, ensure_ascii=False)
-    return _template().render(
-        r=result,
-        stages=stages(result),
-        verdict_text=VERDICTS.get(result.get("verdict", ""), ""),
-        rows=list(_error_rows(result)),
-        floors=any(floor is not None for floor in result.get("noise_floor", {}).values()),
-        bars=_bars(result),
-        estimates=tabled_estimates(result),
-        intervals=_intervals(result),
-        pictures=[(p, _data_uri(p.light), None if p.dark is None else _data_uri(p.dark)) for p in shown],
-        left_out=left_out,
-        changes=list(model_lines(result)),
-        walks=list(episode_words(result)),
-        raw=raw if len(raw) <= LARGEST_RAW else None,
+    return (
+        environment()
+        .get_template("report.html.j2")
+        .render(
+            r=result,
+            explorer=explorer,
+            stages=stages(result),
+            verdict_text=VERDICTS.get(result.get("verdict", ""), ""),
+            rows=list(_error_rows(result)),
+            floors=any(floor is not None for floor in result.get("noise_floor", {}).values()),
+            bars=_bars(result),
+            estimates=tabled_estimates(result),
+            intervals=_intervals(result),
+            pictures=[(p, _data_uri(p.light), None if p.dark is None else _data_uri(p.dark)) for p in shown],
+            left_out=left_out,
+            changes=list(model_lines(result)),
+            walks=list(episode_words(result)),
+            raw=raw if len(raw) <= LARGEST_RAW else None,
+        )
     )
 
 
@@ -120,11 +125,18 @@ def _size(pictures: Sequence[Picture]) -> int:
 
 
 @cache
-def _template() -> Template:
-    from jinja2 import Environment, StrictUndefined
+def environment() -> Environment:
+    """The templates of the pages, with what these write numbers by."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(
+    made = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters.update(
         si=si,
         number=number,
         identifiability=identifiability,
@@ -134,7 +146,7 @@ def _template() -> Template:
         typeset=_typeset,
         count=_count,
     )
-    return environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+    return made
 
 
 def _count(value: float | None) -> str:

@@ -9,14 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.errors import UsageError
 from sysid_btr.report.html import Picture, render
 from sysid_btr.report.style import on_page
-from sysid_btr.run_folder import OVERLAY, REPORT, RESULT, Folder, make_relative
+from sysid_btr.run_folder import EXPLORER, OVERLAY, REPORT, RESULT, SERIES, Folder, make_relative
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.intervals import Profile
     from sysid_btr.posterior.outcome import Posterior
+    from sysid_btr.report.traces import Played
 
     Draw = Callable[[], Figure]
 
@@ -32,6 +33,8 @@ DARK = "dark"
 """Folder of the pictures for a dark page."""
 PNG = b"\x89PNG\r\n\x1a\n"
 """First bytes of a picture."""
+GZIP = b"\x1f\x8b"
+"""First bytes of what was compressed."""
 
 
 @dataclass(frozen=True)
@@ -101,18 +104,20 @@ CAPTIONS: Mapping[str, Caption] = {
 """By name of the picture's file, up to the first underscore; ``btr`` for the overlay of a result of that kind."""
 
 
-def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]]:
-    """Names of an outcome's pictures and what draws them, in the order of the report."""
+def pictures_of(outcome: Fit | Closing | Posterior, played: Callable[[], Played]) -> Iterator[tuple[str, Draw]]:
+    """Names of an outcome's pictures and what draws them, in the order of the report.
+
+    `played` gives what its model does in the held-out episodes.
+    """
     from sysid_btr.identify.curves import curves_of
     from sysid_btr.identify.fit import Fit
     from sysid_btr.posterior.outcome import Posterior
     from sysid_btr.report.curves import plot_curves
-    from sysid_btr.report.figures import figure_of, plot_convergence, plot_overlay, plot_residuals, trace_outcome
+    from sysid_btr.report.figures import figure_of, plot_convergence, plot_overlay, plot_residuals
     from sysid_btr.writeback.write import identified
 
     model = outcome.as_fit if isinstance(outcome, Posterior) else outcome
-    traces = cache(lambda: trace_outcome(model))
-    yield "overlay", lambda: figure_of(plot_overlay(traces()))
+    yield "overlay", lambda: figure_of(plot_overlay(played().worst()))
     if isinstance(outcome, Posterior):
         from sysid_btr.report.posterior import plot_bands, plot_corner, plot_trace
 
@@ -122,7 +127,7 @@ def pictures_of(outcome: Fit | Closing | Posterior) -> Iterator[tuple[str, Draw]
     final = identified(model)
     if curves := curves_of(final.model, final.estimates):
         yield "curves", lambda: figure_of(plot_curves(curves))
-    yield "residuals", lambda: figure_of(plot_residuals(traces()))
+    yield "residuals", lambda: figure_of(plot_residuals(played().worst()))
     if isinstance(outcome, Fit):
         for profile in outcome.profiles:
             yield f"profile_{file_name(profile.name)}", partial(_profile, profile)
@@ -137,11 +142,16 @@ def _profile(profile: Profile) -> Figure:
     return figure_of(plot_profile(profile))
 
 
-def write_pages(folder: Folder, result: dict[str, Any], pictures: Iterable[tuple[str, Draw]]) -> Path:
-    """Write result.json, then pictures and report; a picture that cannot be drawn costs no more than itself.
+def write_pages(
+    folder: Folder,
+    result: dict[str, Any],
+    pictures: Iterable[tuple[str, Draw]],
+    series: Callable[[], bytes] | None = None,
+) -> Path:
+    """Write result.json, then pictures and pages; a picture that cannot be drawn costs no more than itself.
 
     The result is written before anything is drawn, and again with the names of the pictures. Paths in it become
-    relative to the folder.
+    relative to the folder. `series` gives what the page to explore draws, where there is one.
 
     Returns
     -------
@@ -154,6 +164,12 @@ def write_pages(folder: Folder, result: dict[str, Any], pictures: Iterable[tuple
     folder.write(RESULT, to_json(result))
     names, failed = _keep(folder, pictures)
     result["pictures"] = names
+    if series is not None:
+        try:
+            folder.write(SERIES, series())
+            result["explore"] = SERIES
+        except Exception as error:
+            failed.append(f"{EXPLORER}: {type(error).__name__}: {error}")
     if failed:
         result["not_drawn"] = failed
     report = write_report(folder, result)
@@ -178,7 +194,7 @@ def _keep(folder: Folder, pictures: Iterable[tuple[str, Draw]]) -> tuple[list[st
 
 
 def write_report(folder: Folder, result: Mapping[str, Any]) -> Path:
-    """Write report.html from a result and the pictures in the folder.
+    """Write report.html from a result and the pictures in the folder, and explore.html if the folder has its series.
 
     Pictures that result.json lists and that are gone are left out.
 
@@ -194,7 +210,15 @@ def write_report(folder: Folder, result: Mapping[str, Any]) -> Path:
         raise UsageError(
             f"{folder.path / RESULT} lists as pictures {', '.join(strange)}: pictures are PNG files in the same folder"
         )
-    return folder.write(REPORT, render(result, [p for name in names for p in _picture(folder.path, name, result)]))
+    pictures = [p for name in names for p in _picture(folder.path, name, result)]
+    explored = "explore" in result and _is_own(folder.path, folder.path / SERIES, GZIP)
+    report = folder.write(REPORT, render(result, pictures, EXPLORER if explored else None))
+    if explored:
+        from sysid_btr.report.explore import explorer
+
+        files = {file.name for file in folder.path.iterdir()}
+        folder.write(EXPLORER, explorer(result, (folder.path / SERIES).read_bytes(), files))
+    return report
 
 
 def rewrite(folder: Folder, result: dict[str, Any], picture: str) -> None:
@@ -210,9 +234,12 @@ def _is_picture(folder: Path, name: Any) -> bool:
     """Whether a name is that of a PNG file of the folder itself, or of none."""
     if not isinstance(name, str) or Path(name).name != name or Path(name).suffix != ".png":
         return False
-    inside = folder.resolve()
-    files = [file for file in (folder / name, folder / DARK / name) if file.exists()]
-    return all(f.resolve().is_relative_to(inside) and f.read_bytes().startswith(PNG) for f in files)
+    return all(_is_own(folder, f, PNG) for f in (folder / name, folder / DARK / name) if f.exists())
+
+
+def _is_own(folder: Path, file: Path, begins: bytes) -> bool:
+    """Whether a file lies in a folder, through whatever links, and begins as its kind does."""
+    return file.is_file() and file.resolve().is_relative_to(folder.resolve()) and file.read_bytes().startswith(begins)
 
 
 def _picture(folder: Path, name: str, result: Mapping[str, Any]) -> Iterator[Picture]:

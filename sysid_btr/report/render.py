@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.report.bodies import filled
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
 
@@ -134,7 +135,7 @@ def scene_of(outcome: Fit | Closing) -> Scene:
         before = _predicted(study, Model.of(()), i)
         after = _predicted(study, final.model, i)
         logged = np.column_stack(
-            [_filled(log.channels.get(f"position.{j}"), after[:, k]) for k, j in enumerate(index.joints)]
+            [filled(log.channels.get(f"position.{j}"), after[:, k]) for k, j in enumerate(index.joints)]
         )
         poses = {}
         for name, joints in (("log", logged), ("model before", before), ("model after", after)):
@@ -152,15 +153,7 @@ def _predicted(study: Study, model: Model, episode: int) -> FloatArray:
     """Positions (n, joints) of one held-out episode under a model; bridged where it is not predicted."""
     replay = study.holdout_problem(model).episodes[episode].replay
     found = replay.predict(model.values[None]).position[0]
-    return np.column_stack([_filled(column, np.zeros(len(column))) for column in found.T])
-
-
-def _filled(column: FloatArray | None, instead: FloatArray) -> FloatArray:
-    """A column without gaps; another one where it has nothing at all."""
-    if column is None or not np.isfinite(column).any():
-        return instead
-    good = np.flatnonzero(np.isfinite(column))
-    return np.interp(np.arange(len(column)), good, column[good])
+    return np.column_stack([filled(column, np.zeros(len(column))) for column in found.T])
 
 
 def _compared(model: mujoco.MjModel, time: FloatArray, poses: dict[str, FloatArray], among: Any) -> Scene:

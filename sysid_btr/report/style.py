@@ -26,6 +26,11 @@ PALETTE = 255
 """Colours of a picture file, and one; figures have few, and their files are a third as large for it."""
 
 
+def model_colours(count: int) -> tuple[str, ...]:
+    """Colours of so many models, from the plain to the final one."""
+    return (PLAIN, FOUND) if count == 2 else MODEL_COLOURS
+
+
 def page_style(theme: Mapping[str, str]) -> dict[Any, Any]:
     """Matplotlib's settings for a page of a report."""
     return {
