@@ -29,6 +29,8 @@ OUT = Path(__file__).parent / "results" / "kills.json"
 MODEL, LOG = str(SAMPLES / "pendulum.xml"), str(SAMPLES / "pendulum_friction.parquet")
 STUDY = ("-m", MODEL, "-l", LOG, "-f", "mass:*", "-f", "kp:*", "--threads", "1")
 WALK = ("--robot-sim", "ant", "--robot-set", "mass:*=1.1", "--iterations", "2", "--trials", "2", "--duration", "1")
+FIT = ("fit", *STUDY, "-o", "out")
+STIFF = ("-m", MODEL, "-l", LOG, "-f", "kp:*", "--threads", "1")
 PRINTED = "printed"
 """File for what a command prints to stdout."""
 TIMED = ("wall_s",)
@@ -44,13 +46,13 @@ class Command:
     words : of the command line.
     written : file that holds what it found.
     again : flag with which it is given again after a kill.
-    first : of a command that comes before it.
+    first : of commands that come before it.
     """
 
     words: tuple[str, ...]
     written: str
     again: str = "--overwrite"
-    first: tuple[str, ...] = ()
+    first: tuple[tuple[str, ...], ...] = ()
 
 
 COMMANDS = {
@@ -65,7 +67,11 @@ COMMANDS = {
     "replay": Command(("replay", "-m", MODEL, "-l", LOG, "-o", "out"), "out/pendulum_friction.replayed.parquet"),
     "import": Command(("import", LOG, "-o", "out.parquet"), "out.parquet"),
     "init": Command(("init", LOG, "-m", MODEL, "-o", "out.toml"), "out.toml"),
-    "report": Command(("report", "out"), "out/report.html", "", ("fit", *STUDY, "-o", "out")),
+    "report": Command(("report", "out"), "out/report.html", "", (FIT,)),
+    "check": Command(("check", *STUDY, "--effects", "viscous_damping", "--json"), PRINTED, ""),
+    "compare": Command(
+        ("compare", "out", "stiff", "-o", "both"), "both/compare.json", first=(FIT, ("fit", *STIFF, "-o", "stiff"))
+    ),
     "btr": Command(
         ("btr", "-m", "ant", *WALK, "-f", "mass:Trunk", "--threads", "1", "-o", "out"), "out/result.json", "--resume"
     ),
@@ -185,8 +191,8 @@ def _judged(done: subprocess.CompletedProcess[str], target: Path, whole: Whole, 
 
 
 def _prepare(command: Command, folder: str) -> None:
-    if command.first:
-        _run(command.first, folder)
+    for words in command.first:
+        _run(words, folder)
 
 
 def _words(words: Sequence[str]) -> list[str]:

@@ -1,6 +1,6 @@
 """`python -m benchmarks.fuzz`: broken files and strange command lines, by their numbers; resumable.
 
-Cases run in a process of their own, some hundred at a time, so that one that ends the process is seen and passed over.
+Cases run in a process of their own, some thousand at a time, so that one that ends the process is seen and passed over.
 The table counts exit codes by format and lists every case that did what no input may make it do: exit 1, a traceback,
 more than 1 GB, more than 30 s, the end of the process.
 """
@@ -21,7 +21,7 @@ from benchmarks.fuzz.cases import run_case
 from benchmarks.fuzz.examples import make_examples
 
 OUT = Path(__file__).parents[1] / "results" / "fuzz.json"
-BATCH = 400
+BATCH = 2000
 """Cases in one process."""
 
 

@@ -80,7 +80,7 @@ def run(argv: Sequence[str]) -> int:
     """Run the command line; the exit code. No error reaches the user as a traceback."""
     try:
         with interruptible():
-            app(list(argv), prog_name="sysid-btr")
+            _program()(list(argv), prog_name="sysid-btr")
     except SystemExit as end:
         if isinstance(end.__context__, BrokenPipeError):
             raise end.__context__ from None
@@ -104,6 +104,12 @@ def run(argv: Sequence[str]) -> int:
             raise
         return _explain(error)
     return 0
+
+
+@cache
+def _program() -> Callable[..., Any]:
+    """The command line, made of its verbs once in a process."""
+    return typer.main.get_command(app)
 
 
 def _explain(error: Exception) -> int:
