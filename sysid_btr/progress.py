@@ -87,7 +87,7 @@ class ProgressLine:
         if done < self._last:
             self._before += self._last
         self._last = done
-        self.best = best
+        self.best = best if math.isfinite(best) else self.best
         count = self._before + done
         if self._bar is not None:
             self._bar.total = None if total is None else self._before + total

@@ -519,7 +519,7 @@ def test_candidates_are_listed_best_first_with_those_that_did_as_well() -> None:
         ("coulomb_friction",),
     ]
     worse = candidates_of(RULES, fitted([4.0]), trials, None, 1)
-    assert {c.why for c in worse} == {"data that were not fitted do not want it"}
+    assert {c.why for c in worse} == {"held-out data are predicted no better with it"}
     assert all(c.confused_with == () for c in worse), "what makes it worse is confused with nothing"
 
 

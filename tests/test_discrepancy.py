@@ -91,7 +91,7 @@ def test_the_result_says_what_its_intervals_hold_for() -> None:
     found = fitted(CoulombFriction(KNEE), (0.15,))
     [words, *_] = exactness(found.to_dict())
     assert "unknown torques at the joints" in words
-    assert found.message.startswith("what is left of the position is")
+    assert found.message.startswith("the residual of the position is")
 
 
 def test_a_torque_shows_as_its_simulation_does() -> None:

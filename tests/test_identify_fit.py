@@ -32,6 +32,7 @@ from sysid_btr.objectives.covariance import Scatter, covariance
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Parameter
+from sysid_btr.terms.inertial import Payload
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
 GAINS = ("kp:*=shared", "kv:*=shared")
@@ -146,7 +147,7 @@ def test_what_is_taken_as_exact_is_said() -> None:
     assert result["taken_as_exact"] == ["mass:hip", "mass:ankle"]
     assert "the mass of hip, ankle (--nuisance mass=0.1" in " ".join(exactness(result))
     with pytest.raises(
-        UsageError, match=r"--nuisance mass=0: a standard deviation is above zero\n.*did you mean 'mass'"
+        UsageError, match=r"--nuisance mass=0: a standard deviation must be above zero\n.*did you mean 'mass'"
     ):
         fit(replace(study, nuisance={"mass": 0.0, "mas": 0.1}), ["mass:knee"])
 
@@ -437,3 +438,14 @@ def test_hanging_nao(shared_data: Path) -> None:
     ]
     assert not wrong
     assert {e.name for e in masses if e.identifiable == "no"} == {"mass:RHipRoll", "mass:LHipRoll"}
+
+
+def test_a_declared_payload_is_found_from_no_payload_at_all() -> None:
+    """Without a load nothing responds to its place, and a load at the joint moves nothing either."""
+    robot, log, rng = toys.pendulum(), toys.swing(seconds=8.0), np.random.default_rng(3)
+    shown = toys.run(robot, log, [Payload(("arm",))], [0.2, 0.0, 0.0, 0.1, 0.0]).position[0, :, 0]
+    log = replace(log, channels={**log.channels, "position.arm": shown + 4e-4 * rng.normal(size=len(shown))})
+    found = fit(make_study(robot, [log], threads=1), ["payload:arm"])
+    mass, _, _, height, _ = (e.value for e in found.estimates)
+    assert mass * height == pytest.approx(0.02, rel=0.1)
+    assert found.before.holdout["position"].chi2 < 1.3

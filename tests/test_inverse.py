@@ -257,7 +257,7 @@ def test_a_fit_of_a_model_that_lacks_something_says_so_first(arm: Robot) -> None
     wrong = fit(study_of(arm, moved({"dof_frictionloss": (0.0, 0.25, 0.0)})), ["mass:hand"])
     assert wrong.misfit is not None
     assert (wrong.misfit.channel, wrong.misfit.joint) == ("effort", "elbow")
-    assert wrong.message.startswith("what is left of the effort is ")
+    assert wrong.message.startswith("the residual of the effort is ")
     assert wrong.to_dict()["misfit"]["times_noise"] == pytest.approx(wrong.before.train["effort"].chi2 ** 0.5)
     right = fit(study_of(arm, moved()), ["mass:hand"])
     assert right.misfit is None

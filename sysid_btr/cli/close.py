@@ -53,7 +53,7 @@ def close(options: CloseOptions) -> int:
         return close_loop(
             study,
             terms,
-            start=initial_values(terms.parameters, study.robot, options.params),
+            start=initial_values(terms, study.robot, options.params),
             effects=options.effects,
             rng=generator(options.seed),
             journal=journal,

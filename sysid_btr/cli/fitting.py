@@ -189,7 +189,7 @@ def search_of(
             budget=Budget(evaluations=evaluations),
             journal=journal,
             progress=progress,
-            start=initial_values(terms.parameters, robot, options.params, options.start),
+            start=initial_values(terms, robot, options.params, options.start),
             distance=distance,
         )
 

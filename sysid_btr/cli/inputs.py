@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from sysid_btr.models.actuation import Servo
     from sysid_btr.models.robot import Position, Robot
     from sysid_btr.terms.base import Parameter
+    from sysid_btr.terms.model import Terms
 
 
 def find_robot(options: ModelOptions, bounds: Ranges | None = None) -> Robot:
@@ -124,7 +125,7 @@ def as_stated(logs: list[Log], options: ReadingOptions) -> list[Log]:
 
     wrong = [f"{name}={value:g}" for name, value in options.noise.items() if not value > 0]
     if wrong:
-        raise UsageError(f"--noise {', '.join(wrong)}: a standard deviation is above zero")
+        raise UsageError(f"--noise {', '.join(wrong)}: a standard deviation must be above zero")
     _check_streams("--noise", options.noise, logs)
     _check_streams("--shift", options.shift, logs)
     shifted = (shift_streams(log, options.shift) for log in logs)
@@ -196,9 +197,9 @@ def _what_can_be_freed(robot: Robot) -> str:
 
 
 def initial_values(
-    parameters: Sequence[Parameter], robot: Robot, params: Path | None, start: Mapping[str, float] | None = None
+    terms: Terms, robot: Robot, params: Path | None, start: Mapping[str, float] | None = None
 ) -> FloatArray:
-    """Where a search begins: nominal values, but for those of an earlier run, and for those given by name or glob.
+    """Where a search begins: as the terms have it, but for values of an earlier run, and those given by name or glob.
 
     Raises
     ------
@@ -207,10 +208,7 @@ def initial_values(
     """
     from fnmatch import fnmatchcase
 
-    import numpy as np
-
-    values = np.array([p.nominal for p in parameters])
-    problems = []
+    values, parameters, problems = terms.begin, terms.parameters, []
     for name, value in [*_known(params, robot, parameters).items(), *(start or {}).items()]:
         chosen = [i for i, p in enumerate(parameters) if p.name == name] or [
             i for i, p in enumerate(parameters) if fnmatchcase(p.name, name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import nan
 
 import numpy as np
 
@@ -42,10 +43,10 @@ def eliminate(state: State, rules: Selection, progress: Progress) -> State:
         again = refit(study, state.fitted.model)
         state = replace(state, study=study, fitted=again).spent(again.evaluations)
     study = inflate(state.study, state.fitted, memory=True)
-    progress(done=rules.rounds, total=None, best=state.fitted.holdout, note="final fit")
+    progress(done=state.replays, total=None, best=nan, note="final fit")
     polished = refit(study, state.fitted.model, polish=True, progress=progress)
     state = replace(state, study=study, fitted=polished).spent(polished.evaluations)
-    progress(done=rules.rounds, total=None, best=state.fitted.holdout, note="intervals")
+    progress(done=state.replays, total=None, best=nan, note="intervals")
     state = with_intervals(state, rules)
     real = _distinguishable_from_nothing(state, rules)
     if real is not None:

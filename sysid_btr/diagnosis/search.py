@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import nan
 from time import perf_counter
 from typing import get_args
 
@@ -52,8 +53,9 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             break
         now = state.fitted
 
-        def say(note: str, number: int = number, best: float = now.holdout) -> None:
-            progress(done=number, total=None, best=best, note=f"round {number}: {note}")
+        def say(note: str, number: int = number, at: State = state) -> None:
+            so_far = f"(so far {at.fitted.holdout:.4g})"
+            progress(done=at.replays, total=None, best=nan, note=f"round {number}: {note} {so_far}")
 
         state, trials = _try_promising(state, library, rules, say)
         worthy = [t for t in trials if _is_worthy(rules, state, t)]
@@ -84,7 +86,7 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
 
 def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:
     """Refit the hypotheses of a scan, the most promising first, while they may matter."""
-    say("scan")
+    say("scan for what lowers the held-out chi2")
     hypotheses, answers = leading_hypotheses(state, library, rules)
     state = state.spent(answers)
     trials: list[Trial] = []

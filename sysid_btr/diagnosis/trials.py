@@ -203,15 +203,15 @@ def fate(rules: Selection, before: Fitted, trial: Trial, winner: Trial | None) -
     if not np.isfinite(trial.fitted.holdout):
         return "its replay diverges"
     if not is_wanted(rules, before, trial):
-        return "data that were not fitted do not want it"
+        return "held-out data are predicted no better with it"
     if winner is None:
-        return "removes too little of what was there at first"
+        return "removes too little of the first error"
     best = winner.hypothesis
     if trial.fitted.misfit > winner.fitted.misfit + rules.simpler:
         return f"leaves more than {best}"
     if trial.hypothesis.complexity > best.complexity:
         return f"predicts no better than {best}, which is simpler"
-    return f"does as well as {best}, and gives way to it"
+    return f"predicts as well as {best}, which was added"
 
 
 def is_wanted(rules: Selection, before: Fitted, trial: Trial) -> bool:

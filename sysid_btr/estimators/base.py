@@ -110,7 +110,10 @@ class Progress(Protocol):
     """Called after every batch of evaluations."""
 
     def __call__(self, *, done: int, total: int | None, best: float, note: str) -> None:
-        """Report `done` of `total` candidates (None: no limit), the best loss, and what is going on."""
+        """Report `done` of `total` candidates (None: no limit), the best loss, and what is going on.
+
+        The loss is what the present search minimises on the data that it fits; NaN between searches.
+        """
         ...
 
 

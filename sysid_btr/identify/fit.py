@@ -158,7 +158,7 @@ def fit(
     budget, journal, progress : see `sysid_btr.estimators`. The budget is that of all searches of the fit together; what
         prepares them (numerics, the realisation of a servo) and what describes their result is not counted. Without
         `progress` a line is shown where stderr is a terminal or a notebook; `silent` shows none.
-    start : (p,) where to begin; default the nominal values.
+    start : (p,) where to begin; default the nominal values, of a payload a small mass.
     distance : minimised instead of the whitened squares (MSE, phi2), by an estimator that needs no residuals.
         Intervals are then those of the likelihood at the point found.
 
@@ -180,7 +180,7 @@ def fit(
     estimator = LeastSquares() if estimator is None else estimator
     check_distance(estimator, distance)
     rng = np.random.default_rng(0) if rng is None else rng
-    model = Model.of(terms, start)
+    model = Model.of(terms, terms.begin if start is None else start)
     budget = budget or Budget()
     search = _Search(estimator, distance, rng, budget, Journal() if journal is None else journal, progress)
     solved = search.run(realise_servo(study, model), model)

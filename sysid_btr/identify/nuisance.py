@@ -47,8 +47,8 @@ def error_of_the_rest(study: Study, model: Model, jacobian: FloatArray) -> Float
         return np.zeros(len(model.values))
     if study.procedure.fuses:
         raise UsageError(
-            "--nuisance: estimates of a floating-base log come from its contact-free motion, too, for which this is "
-            "not known; declare what may be off with --fit"
+            "--nuisance: of a floating-base log in segments the contact-free motion counts too, for which this is not "
+            "known; fit what may be off, or use --mode innovations"
         )
     rest = list(_undeclared(study, model.terms))
     if not rest:
@@ -94,7 +94,8 @@ def check_nuisance(robot: Robot, nuisance: Mapping[str, float]) -> None:
     UsageError
         With all of them.
     """
-    problems = [f"{name}={std:g}: a standard deviation is above zero" for name, std in nuisance.items() if not std > 0]
+    low = {name: std for name, std in nuisance.items() if not std > 0}
+    problems = [f"{name}={std:g}: a standard deviation must be above zero" for name, std in low.items()]
     for name in nuisance:
         try:
             check_expression(name, robot)

@@ -82,8 +82,8 @@ class Misfit:
     def words(self) -> str:
         """In a sentence."""
         return (
-            f"what is left of the {self.channel} is {self.times_noise:.2g} times its noise, most at {self.joint}: the "
-            "model lacks something (`sysid-btr close` looks for what is missing)"
+            f"the residual of the {self.channel} is {self.times_noise:.2g} times its noise, largest at {self.joint}: "
+            "the model lacks something (`sysid-btr close` looks for what is missing)"
         )
 
 

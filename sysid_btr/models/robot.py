@@ -145,7 +145,7 @@ def robot_from_file(path: Path) -> Robot:
 
     if urdf is None and path.suffix != path.suffix.lower():
         raise ModelError(
-            f"model {path}: MuJoCo reads no {path.suffix}: rename the file to end in {path.suffix.lower()}"
+            f"model {path}: MuJoCo does not read {path.suffix}: rename the file to end in {path.suffix.lower()}"
         )
     try:
         make_spec().compile()

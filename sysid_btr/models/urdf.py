@@ -79,7 +79,7 @@ def _without_repeats(path: Path, root: ElementTree.Element) -> Iterator[str]:
             + "\nDelete the wrong one of each."
         )
     if same:
-        yield f"stands twice, alike, and is read once: {some(dict.fromkeys(same))}"
+        yield f"is given twice with the same content, and read once: {some(dict.fromkeys(same))}"
 
 
 def _said(element: ElementTree.Element) -> str:

@@ -88,8 +88,8 @@ class Comparison:
 class ReplayProblem:
     """Whitened residuals of episodes under candidates: a `ResidualProblem` of the estimators.
 
-    The whitened residual of a sample is (measured - predicted) / sigma; the loss is half minus twice the
-    Gaussian log-likelihood up to a constant, that is the sum of squares.
+    The whitened residual of a sample is (measured - predicted) / sigma; the loss is their sum of squares,
+    minus twice the Gaussian log-likelihood up to a constant.
 
     Attributes
     ----------

@@ -309,6 +309,11 @@ class Term:
         """(parameters,) values at which the model is exactly the plain one."""
         return np.array([p.nominal for p in self.parameters])
 
+    @property
+    def begin(self) -> FloatArray:
+        """(parameters,) values at which a search begins that is told nothing else."""
+        return self.neutral
+
     def spread(self, values: FloatArray) -> FloatArray:
         """Candidate numbers (m, parameters) as (m, places, kinds); one kind alone where that is `absolute`."""
         shaped = values.reshape(len(values), len(self.groups), len(self.numbers))

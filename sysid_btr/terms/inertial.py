@@ -155,6 +155,14 @@ class Payload(Effect):
         values[0] *= total
         return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
 
+    @property
+    def begin(self) -> FloatArray:
+        """A small load: where there is none, nothing responds to its place."""
+        kinds = self.numbers * len(self.groups)
+        return np.array(
+            [p.scale if k.name == "mass" else p.nominal for k, p in zip(kinds, self.parameters, strict=True)]
+        )
+
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         allow_any_inertia(spec, self.places)
 

@@ -43,6 +43,12 @@ class Terms(tuple[Term, ...]):
         return np.array([p.nominal for p in self.parameters], dtype=np.float64)
 
     @property
+    def begin(self) -> FloatArray:
+        """(p,) values at which a search begins that is told nothing else."""
+        values = np.concatenate([np.zeros(0), *(term.begin for term in self)])
+        return np.asarray(np.clip(values, self.lower, self.upper))
+
+    @property
     def lower(self) -> FloatArray:
         """(p,) lower bounds."""
         return np.array([p.lower for p in self.parameters], dtype=np.float64)
