@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from browser import BROWSER, browse
 
 import sysid_btr as sb
 from sysid_btr.cli import run
@@ -79,3 +80,7 @@ def test_the_afternoon(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "dry friction" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     shell("report", folder / "out")
+    if BROWSER is not None:
+        explored = browse(folder / "out" / "explore.html", folder, 1200)
+        assert explored["ready"] == "yes"
+        assert str(friction["value"])[:10] in explored["saved"][1]

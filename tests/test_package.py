@@ -46,6 +46,7 @@ def test_a_wheel_fits_and_reports_away_from_its_sources(tmp_path: Path) -> None:
     assert Path(package).is_relative_to(site)
     assert Path(samples).is_relative_to(site)
     assert {"result.json", "model.xml", "report.html", "explore.html"} <= {file.name for file in out.iterdir()}
+    assert (site / "sysid_btr" / "guide" / "verdicts.md").is_file()
 
 
 def test_the_citation_names_this_version() -> None:

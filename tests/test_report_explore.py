@@ -6,7 +6,6 @@ import gzip
 import json
 import re
 import shutil
-import subprocess
 from base64 import b64decode
 from pathlib import Path
 from typing import Any
@@ -14,23 +13,32 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from browser import browse
 from terminal import Cli
 
 from sysid_btr.cli import run
 from sysid_btr.cli.demo import sample_logs
+from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.study import make_study
+from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import joint_names
+from sysid_btr.objectives.targets import COMPARED
 from sysid_btr.report.bodies import bodies_of, placed
-from sysid_btr.report.explore import NEXT, explorer, next_step
+from sysid_btr.report.explore import MOST_NUMBERS, NEXT, explorable, explorer, next_step
+from sysid_btr.report.guide import about_verdict
 from sysid_btr.report.style import DARK, LIGHT
+from sysid_btr.report.traces import Played, PlayedEpisode, Trace
 from sysid_btr.result import read_result, result_schema
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.terms.base import Outputs
 
 SAMPLES = sample_logs()
 LEG, LOG = SAMPLES / "leg.xml", SAMPLES / "leg_friction.parquet"
-WATCH = Path(__file__).with_name("browse.html")
 LARGEST = 8_000_000
+EMPTY = {"kind": "fit", "message": "", "model": {"name": ""}, "parameters": [], "effects": []}
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +93,8 @@ def test_every_joint_is_there_as_logged_and_as_scored(folder: Path) -> None:
 
 
 def test_bodies_stand_where_mujoco_puts_them(folder: Path) -> None:
-    (episode,) = series(folder)["episodes"]
+    content = series(folder)
+    (episode,) = content["episodes"]
     scene, log = episode["scene"], read_log(LOG)
     model = mujoco.MjModel.from_xml_path(str(LEG))
     data = mujoco.MjData(model)
@@ -97,7 +106,7 @@ def test_bodies_stand_where_mujoco_puts_them(folder: Path) -> None:
         for joint in log.joints("position"):
             data.qpos[model.joint(joint).qposadr[0]] = log.channels[f"position.{joint}"][row]
         mujoco.mj_kinematics(model, data)
-        for k, body in enumerate(scene["bodies"]):
+        for k, body in enumerate(content["bodies"]):
             assert poses[frame, 0, k, :3] * scene["extent"] == pytest.approx(data.body(body["name"]).xpos, abs=1e-4)
             assert poses[frame, 0, k, 3:] == pytest.approx(data.body(body["name"]).xquat, abs=1e-4)
 
@@ -195,6 +204,34 @@ def test_it_is_one_offline_file_that_can_be_written_again(cli: Cli, folder: Path
     assert page.read_bytes() == before
 
 
+def test_a_log_that_is_too_long_is_thinned_and_the_page_says_so() -> None:
+    """Noise, which nothing compresses, in every sensor of 22 joints at 500 Hz for 40 s, under three models."""
+    rng = np.random.default_rng(0)
+    time = np.arange(20_000) / 500
+    robot = load_robot(str(SAMPLES / "nao.xml"))
+    joints = joint_names(robot)
+    names = [f"{channel}.{joint}" for channel in ("command", *COMPARED) for joint in joints]
+    channels = {name: 0.3 * rng.normal(size=len(time)) for name in names}
+    episode = FixedEpisode.whole(robot, Log(time, channels, LogMeta(), np.zeros(len(time), dtype=np.int64)))
+    replay = episode.replay((), Numerics("RK4", 0.002))
+    traces = [
+        Trace(joint, channel, "rad", time, channels[f"command.{joint}"], channels[f"{channel}.{joint}"],
+              {name: 0.3 * rng.normal(size=len(time)) for name in "abc"}, 28.0, 1e-3, dict.fromkeys("abc", 1.0))
+        for channel in COMPARED
+        for joint in joints
+    ]  # fmt: skip
+    shape = (1, len(time), len(joints))
+    outputs = {n: Outputs(time, 0.3 * rng.normal(size=shape), np.zeros(shape), None) for n in "abc"}
+    long = explorable(Played((PlayedEpisode("", episode, replay, outputs, tuple(traces)),), ("a", "b", "c"), "a"))
+    content = json.loads(gzip.decompress(long))
+    stride = content["stride"]
+    assert stride > 1
+    assert unpacked(content["episodes"][0]["time"]) == pytest.approx(time[::stride], abs=1e-5)
+    numbers = sum(unpacked(s["log"]).size * (2 + len(s["predicted"])) for s in content["episodes"][0]["sensors"])
+    assert 0.5 * MOST_NUMBERS < numbers <= 1.01 * MOST_NUMBERS
+    assert len(explorer({**EMPTY, "padding": "x" * 1_000_000}, long, set())) < LARGEST
+
+
 def test_names_from_somebody_else_are_shown_and_not_run(folder: Path) -> None:
     evil = "</script><script>alert(1)</script>"
     result = {**read_result(folder), "message": evil}
@@ -214,6 +251,16 @@ def test_series_from_outside_the_folder_are_not_read(cli: Cli, folder: Path, tmp
     assert "explore.html" not in (theirs / "report.html").read_text()
 
 
+@pytest.mark.parametrize("verdict", sorted(NEXT))
+def test_the_page_says_what_its_verdict_means_as_the_guide_does(folder: Path, verdict: str) -> None:
+    about = about_verdict(verdict)
+    assert about.count("<p>") >= 2
+    assert "<i>Do</i>" in about
+    assert not re.search(r"[`*|]|\]\(", re.sub("<code>.*?</code>", "", about)), "no Markdown is left"
+    assert about in explorer({**read_result(folder), "verdict": verdict}, b"", set())
+    assert about_verdict("") == about_verdict("no verdict") == ""
+
+
 def test_what_comes_next_is_said_of_every_outcome(folder: Path) -> None:
     result = read_result(folder)
     verdicts = result_schema()["properties"]["verdict"]["enum"]
@@ -229,29 +276,6 @@ def test_what_comes_next_is_said_of_every_outcome(folder: Path) -> None:
 
 
 # --- a real browser -----------------------------------------------------------------------------------------
-
-
-def browse(page: Path, home: Path, width: int, *, dark: bool = False) -> Any:
-    """What a browser finds on a page in a frame of some width; skips where there is none."""
-    browser = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
-    if browser is None:
-        pytest.skip("no chromium or chrome on this machine")
-    watch = home / "watch.html"
-    watch.write_text(WATCH.read_text().replace("@PAGE", page.as_uri()).replace("@WIDTH", str(width)))
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--window-size=1300,1000", "--allow-file-access-from-files"]
-    flags += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={home / 'profile'}", "--enable-logging=stderr"]
-    flags += ["--force-dark-mode", "--blink-settings=preferredColorScheme=0"] if dark else []
-    done = subprocess.run(
-        [browser, *flags, "--virtual-time-budget=60000", "--dump-dom", watch.as_uri()],
-        capture_output=True, text=True, check=True, timeout=180,
-    )  # fmt: skip
-    assert "CONSOLE" not in done.stderr, done.stderr
-    match = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
-    assert match is not None
-    assert match.group(1), "the page was ready in time"
-    found = json.loads(match.group(1).replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
-    assert "error" not in found, found["error"]
-    return found
 
 
 @pytest.mark.slow

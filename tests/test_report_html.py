@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import BROWSER
 from matplotlib.figure import Figure
 from PIL import Image
 from terminal import Cli
@@ -271,8 +272,7 @@ def test_results_show_themselves_in_a_notebook(fitted: Fit) -> None:
 
 @pytest.mark.parametrize("dark_page", [False, True], ids=["light", "dark"])
 def test_a_browser_shows_the_page_as_the_reader_likes_it(folders: Path, tmp_path: Path, dark_page: bool) -> None:
-    browser = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
-    if browser is None:
+    if BROWSER is None:
         pytest.skip("no chromium or chrome on this machine")
     shot = tmp_path / "page.png"
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=900,1200"]
@@ -281,7 +281,7 @@ def test_a_browser_shows_the_page_as_the_reader_likes_it(folders: Path, tmp_path
     # offline: whatever the page asked for from outside would be missing
     flags += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}"]
     subprocess.run(
-        [browser, *flags, f"--screenshot={shot}", (folders / "fit" / "report.html").as_uri()],
+        [BROWSER, *flags, f"--screenshot={shot}", (folders / "fit" / "report.html").as_uri()],
         capture_output=True, check=True, timeout=60,
     )  # fmt: skip
     pixels: Any = np.asarray(Image.open(shot).convert("L"))

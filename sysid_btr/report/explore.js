@@ -103,6 +103,7 @@ const sensors = () => episode().sensors.filter(s => s.channel === state.channel)
 const sensor = () => sensors().find(s => s.joint === state.joint) ?? sensors()[0];
 
 function prepare() {
+  data.bodies.forEach(prepareBody);
   for (const e of data.episodes) {
     e.time = array(e.time);
     for (const s of e.sensors) {
@@ -287,7 +288,7 @@ function tables() {
   const step = s => [...s.added.map(a => `+ ${a}`), ...s.removed.map(a => `− ${a}`)].join(", ") || "parameters fitted";
   table("steps", "Steps", "chi2: mean square error over that of the noise, 1 at the floor.",
     [["", s => result.steps.indexOf(s) + 1], ["step", step], ["chi2, fitted", "train"], ["chi2, held out", "holdout"]], result.steps);
-  table("candidates", "Effects that were weighed", "", [["round", "round"], ["effect", "effect"], ["where", c => c.where.join(", ")],
+  table("candidates", "Effects that were considered", "", [["round", "round"], ["effect", "effect"], ["where", c => c.where.join(", ")],
     ["amount", "amplitude"], ["would explain, %", c => percent(c.explained)], ["what became of it", "why"]], result.candidates);
   $("candidates").parentElement.hidden = !result.candidates.length;
 }
@@ -311,14 +312,15 @@ function search() {
 // --- the robot --------------------------------------------------------------------------------------------------
 
 const look = { azimuth: 2.2, elevation: 0.3, zoom: 1 };
+function prepareBody(body) {
+  body.vertices = array(body.vertices);
+  body.faces = array(body.faces);
+  body.middle = [0, 1, 2].map(k => { let s = 0; for (let i = k; i < body.vertices.length; i += 3) s += body.vertices[i]; return 3 * s / body.vertices.length; });
+}
 function prepareScene(scene) {
   scene.time = array(scene.time);
+  scene.bodies = data.bodies;
   const raw = array(scene.poses), count = scene.bodies.length;
-  for (const body of scene.bodies) {
-    body.vertices = array(body.vertices);
-    body.faces = array(body.faces);
-    body.middle = [0, 1, 2].map(k => { let s = 0; for (let i = k; i < body.vertices.length; i += 3) s += body.vertices[i]; return 3 * s / body.vertices.length; });
-  }
   const spot = new Float64Array(12);
   scene.place = (frame, who, b) => {  // rotation by rows, then position, m
     const at = ((frame * 3 + who) * count + b) * 7, [w, x, y, z] = [3, 4, 5, 6].map(k => raw[at + k] / 32767), u = scene.extent / 32767;
@@ -358,7 +360,7 @@ function paint(canvas, scene, frame, who) {
   const [ca, sa, ce, se] = [Math.cos(look.azimuth), Math.sin(look.azimuth), Math.cos(look.elevation), Math.sin(look.elevation)];
   const right = [-sa, ca, 0], up = [-se * ca, -se * sa, ce], toward = [ce * ca, ce * sa, se];
   const across = v => v.reduce((sum, c, k) => sum + Math.abs(c) * scene.reach[k], 1e-3);  // half of what the box takes
-  const size = look.zoom * 0.54 * Math.min(width / across(right), height / across(up)), here = scene.middle(frame, 0, 0);
+  const size = look.zoom * 0.48 * Math.min(width / across(right), height / across(up)), here = scene.middle(frame, 0, 0);
   const centre = scene.floating ? scene.centre.map((c, k) => c + here[k] - scene.home[k]) : scene.centre;
   const dot = (v, x, y, z) => v[0] * x + v[1] * y + v[2] * z;
   const ghost = matchMedia("(prefers-color-scheme: dark)").matches ? [92, 99, 108] : [196, 201, 207];

@@ -19,6 +19,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.report.bodies import Body, bodies_of, filled, placed
+from sysid_btr.report.guide import about_verdict
 from sysid_btr.report.html import VERDICTS, environment
 from sysid_btr.report.style import model_colours
 from sysid_btr.report.traces import Played, PlayedEpisode, Trace
@@ -28,7 +29,7 @@ from sysid_btr.run_folder import DRAWS, MODEL, PARAMS, REPORT, RESULT
 if TYPE_CHECKING:
     import mujoco
 
-MOST_NUMBERS = 700_000
+MOST_NUMBERS = 600_000
 """Numbers of all series together; of longer logs every other sample is left out, or more."""
 FRAMES, RATE = 600, 25.0
 """Poses of the robot, of all episodes together and in a second at most."""
@@ -42,17 +43,19 @@ def explorable(played: Played) -> bytes:
     """What the page draws of held-out episodes: content of ``explore.json.gz``."""
     sensors = sum(len(item.traces) * len(item.episode.log) for item in played.episodes)
     stride = max(int(np.ceil(sensors * (2 + len(played.models)) / MOST_NUMBERS)), 1)
+    bodies = bodies_of(played.episodes[0].replay.model) if played.episodes else ()
     content = {
         "models": played.models,
         "colours": model_colours(len(played.models)),
         "rank_by": played.models.index(played.rank_by),
         "stride": stride,
-        "episodes": [_episode(played, item, stride) for item in played.episodes],
+        "bodies": [_body(body) for body in bodies],
+        "episodes": [_episode(played, item, stride, bodies) for item in played.episodes],
     }
     return gzip.compress(json.dumps(content, separators=(",", ":")).encode(), 6, mtime=0)
 
 
-def _episode(played: Played, item: PlayedEpisode, stride: int) -> dict[str, Any]:
+def _episode(played: Played, item: PlayedEpisode, stride: int, bodies: tuple[Body, ...]) -> dict[str, Any]:
     log = item.episode.log
     ordered = sorted(item.traces, key=lambda trace: -trace.error(played.rank_by))
     frames = max(FRAMES // len(played.episodes), 2)
@@ -62,7 +65,7 @@ def _episode(played: Played, item: PlayedEpisode, stride: int) -> dict[str, Any]
         "split": item.episode.begin,
         "channels": list(dict.fromkeys(trace.channel for trace in item.traces)),
         "sensors": [_sensor(trace, stride) for trace in ordered],
-        "scene": _scene(item, frames),
+        "scene": _scene(item, bodies, frames) if bodies else None,
     }
 
 
@@ -79,12 +82,9 @@ def _sensor(trace: Trace, stride: int) -> dict[str, Any]:
     }
 
 
-def _scene(item: PlayedEpisode, frames: int) -> dict[str, Any] | None:
-    """The robot as logged and as the first and the last model have it; None where it has no shape."""
+def _scene(item: PlayedEpisode, bodies: tuple[Body, ...], frames: int) -> dict[str, Any]:
+    """The robot as logged and as the first and the last model have it."""
     model, time = item.replay.model, item.episode.log.time - item.episode.log.time[0]
-    bodies = bodies_of(model)
-    if not bodies:
-        return None
     count = int(min(frames, max(RATE * time[-1], 2), len(time)))
     rows = np.unique(np.searchsorted(time, np.linspace(0, time[-1], count)).clip(0, len(time) - 1))
     poses = np.stack([placed(model, bodies, pose[rows]) for pose in _poses(item)], axis=1)
@@ -95,7 +95,6 @@ def _scene(item: PlayedEpisode, frames: int) -> dict[str, Any] | None:
         "time": packed(time[rows], "f4"),
         "extent": extent,
         "poses": packed(np.rint(poses), "i2"),
-        "bodies": [_body(body) for body in bodies],
         "floating": item.episode.log.meta.mount == "free",
     }
 
@@ -166,6 +165,7 @@ def explorer(result: Mapping[str, Any], series: bytes, files: Collection[str]) -
         r=result,
         verdict_text=VERDICTS.get(result.get("verdict", ""), ""),
         next_step=next_step(result),
+        about=about_verdict(result.get("verdict", "")),
         links=[(name, words) for name, words in FILES.items() if name in files],
         result=json.dumps(result, ensure_ascii=False).replace("<", "\\u003c"),
         series=b64encode(series).decode(),
