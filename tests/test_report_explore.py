@@ -297,6 +297,8 @@ def test_a_browser_shows_one_cursor_over_everything(folder: Path, tmp_path: Path
         assert early[part] != late[part]
     assert played["cursors"][0][0] != 12.5
     assert played["cursors"][0][0] == played["cursors"][1][0]
+    whole, half, again = found["spans"]
+    assert [2 * half, again] == pytest.approx([whole, whole])
     first, second, back = found["joint"]
     assert first != second
     assert back == first

@@ -6,6 +6,7 @@ const KINDS = { f4: Float32Array, i2: Int16Array, u2: Uint16Array };
 const array = packed => new KINDS[packed.type](bytes(packed.data).buffer);
 const MOST_POINTS = 4000, STRETCHES = 300, NARROW = 600;
 const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const touch = matchMedia("(pointer: coarse)").matches;  // there a finger on a picture scrolls the page
 const narrow = () => innerWidth <= NARROW;
 
 async function unpacked(id) {
@@ -28,7 +29,7 @@ function si(value, unit, digits = 4) {
 }
 function shown(value, digits = 4) {
   if (value === null || value === undefined || value === "") return "";
-  if (typeof value !== "number") return String(value);
+  if (typeof value !== "number") return String(value).replaceAll("+-", "±").replaceAll("->", "→");
   return isFinite(value) ? String(Number(value.toPrecision(digits))).replace("-", "−") : "–";
 }
 function digitsOf(value, std) {
@@ -126,7 +127,7 @@ function sample(times, t) {  // the last sample up to t
 
 function base(height, more = {}) {
   return {
-    height, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", dragmode: "zoom", hoverdistance: -1,
+    height, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", dragmode: touch ? false : "zoom", hoverdistance: -1,
     font: { family: "system-ui, sans-serif", size: narrow() ? 11 : 12, color: css("--ink") },
     margin: { l: narrow() ? 52 : 66, r: 12, t: 34, b: 38 }, ...more,
   };
@@ -457,6 +458,21 @@ function moveTo(time) {
   readout();
   robots();
 }
+function zoom(factor) {  // about the cursor
+  const t = episode().time, first = t[0], last = t[t.length - 1], [low, high] = range ?? [first, last], span = factor * (high - low);
+  const from = Math.min(Math.max(state.time - span / 2, first), last - span);
+  range = span >= last - first ? null : [from, from + span];
+  signals();
+  cursors();
+}
+function keys(event) {
+  if (event.target.closest("input, select, button, summary, a") || event.ctrlKey || event.metaKey || event.altKey) return;
+  const t = episode().time, by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+  if (by) moveTo(t[Math.min(Math.max(sample(t, state.time) + by * (event.shiftKey ? 10 : 1), 0), t.length - 1)]);
+  else if (event.key === " ") play(!state.playing);
+  else return;
+  event.preventDefault();
+}
 let before = null;  // ms, of the frame before
 function tick(now) {
   if (!state.playing) return;
@@ -508,6 +524,9 @@ function wire() {
   $("next").onclick = () => turn(1);
   $("play").onclick = () => play(!state.playing);
   $("time").oninput = event => moveTo(Number(event.target.value));
+  $("in").onclick = () => zoom(0.5);
+  $("out").onclick = () => zoom(2);
+  document.onkeydown = keys;
   $("closer").onclick = () => { look.zoom *= 1.25; robots(); };
   $("farther").onclick = () => { look.zoom /= 1.25; robots(); };
   document.querySelectorAll("#robots canvas").forEach(turnable);
@@ -537,7 +556,8 @@ async function main() {
   document.head.append(make("script", await unpacked("plotly")));
   prepare();
   document.querySelector("main").hidden = false;
-  $("about").textContent = "Drag over a picture to zoom, double-click to see all; a click sets the cursor. Play runs over what is zoomed to."
+  $("about").textContent = (touch ? "Tap a picture to set the cursor. " : "Drag over a picture to zoom, double-click to see all; a click or the arrow keys set the cursor. ")
+    + "Play runs over what is zoomed to."
     + (data.stride > 1 ? ` One of ${data.stride} samples is shown.` : "");
   state.channel = episode().channels[0];
   state.time = start();
