@@ -29,9 +29,11 @@ from sysid_btr.objectives.targets import COMPARED
 from sysid_btr.report.bodies import bodies_of, placed
 from sysid_btr.report.explore import MOST_NUMBERS, NEXT, explorable, explorer, next_step
 from sysid_btr.report.guide import about_verdict
+from sysid_btr.report.pictures import write_pages
 from sysid_btr.report.style import DARK, LIGHT
 from sysid_btr.report.traces import Played, PlayedEpisode, Trace
 from sysid_btr.result import read_result, result_schema
+from sysid_btr.run_folder import Folder
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Outputs
 
@@ -261,6 +263,24 @@ def test_the_page_says_what_its_verdict_means_as_the_guide_does(folder: Path, ve
     assert about_verdict("") == about_verdict("no verdict") == ""
 
 
+def test_a_page_of_an_earlier_run_does_not_stay_beside_another(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(folder, out)
+    result = {name: value for name, value in read_result(folder).items() if name != "explore"}
+    write_pages(Folder(out), result, [])
+    assert not {"explore.html", "explore.json.gz"} & {file.name for file in out.iterdir()}
+    assert "explore.html" not in (out / "report.html").read_text()
+
+
+def test_a_page_that_cannot_be_made_costs_no_more_than_itself(folder: Path, tmp_path: Path) -> None:
+    def fails() -> bytes:
+        raise ValueError("no such body")
+
+    write_pages(Folder(tmp_path), read_result(folder), [], fails)
+    assert read_result(tmp_path)["not_drawn"] == ["explore.html: ValueError: no such body"]
+    assert not (tmp_path / "explore.html").exists()
+
+
 def test_what_comes_next_is_said_of_every_outcome(folder: Path) -> None:
     result = read_result(folder)
     verdicts = result_schema()["properties"]["verdict"]["enum"]
@@ -311,6 +331,17 @@ def test_a_browser_shows_one_cursor_over_everything(folder: Path, tmp_path: Path
     result = read_result(folder)
     assert f"{result['after']['holdout']['position']['joints'][first[0]]!r}"[:12] in errors
     assert all(p["name"] in parameters and f"{p['value']!r}"[:12] in parameters for p in result["parameters"])
+
+
+@pytest.mark.slow
+def test_no_table_of_a_comparison_is_cut(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    assert run(["compare", str(folder), str(other), "--out", str(tmp_path / "both")]) == 0
+    found = browse(tmp_path / "both" / "compare.html", tmp_path, 400)
+    assert found["width"][1] <= found["width"][0] == 400
+    assert found["cut"] == []
+    assert found["scrolled"] == 0
 
 
 @pytest.mark.slow

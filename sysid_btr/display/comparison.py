@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sysid_btr.display.pages import templates
 from sysid_btr.units import probability, si_all, with_digits_of
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-TEMPLATE = Path(__file__).with_name("comparison.html.j2")
 Table = tuple[str, list[str], list[list[str]]]
 """Heading, names of the columns, and rows of texts."""
 
@@ -144,9 +144,6 @@ def show(content: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 def page(content: Mapping[str, Any], *, whole: bool = True) -> str:
     """As HTML: a page that needs nothing else, or its body alone."""
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     found: Sequence[Table] = list(tables(content))
+    template = templates(Path(__file__).parent).get_template("comparison.html.j2")
     return template.render(c=content, tables=found, rule=rule(content), whole=whole)

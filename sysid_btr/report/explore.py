@@ -33,6 +33,8 @@ MOST_NUMBERS = 600_000
 """Numbers of all series together; of longer logs every other sample is left out, or more."""
 FRAMES, RATE = 600, 25.0
 """Poses of the robot, of all episodes together and in a second at most."""
+SCRIPTS = ("robot.js", "explore.js")
+"""What the page does, in the order in which it is read."""
 GRID = 32767
 """Positions and quaternions of bodies are whole numbers up to this one."""
 FILES = {REPORT: "printed report", MODEL: "model.xml", PARAMS: "params.json", RESULT: "result.json", DRAWS: "draws"}
@@ -170,7 +172,7 @@ def explorer(result: Mapping[str, Any], series: bytes, files: Collection[str]) -
         result=json.dumps(result, ensure_ascii=False).replace("<", "\\u003c"),
         series=b64encode(series).decode(),
         plotly=_plotly(),
-        script=Path(__file__).with_name("explore.js").read_text(encoding="utf-8"),
+        script="\n".join(Path(__file__).with_name(name).read_text(encoding="utf-8") for name in SCRIPTS),
     )
 
 

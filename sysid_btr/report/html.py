@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sysid_btr.display.changes import model_lines
+from sysid_btr.display.pages import templates
 from sysid_btr.display.text import (
     certainty_words,
     channel_scores,
@@ -127,15 +128,7 @@ def _size(pictures: Sequence[Picture]) -> int:
 @cache
 def environment() -> Environment:
     """The templates of the pages, with what these write numbers by."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    made = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    made = templates(Path(__file__).parent)
     made.filters.update(
         si=si,
         number=number,

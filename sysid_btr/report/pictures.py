@@ -164,6 +164,8 @@ def write_pages(
     folder.write(RESULT, to_json(result))
     names, failed = _keep(folder, pictures)
     result["pictures"] = names
+    for earlier in (EXPLORER, SERIES):
+        (folder.path / earlier).unlink(missing_ok=True)
     if series is not None:
         try:
             folder.write(SERIES, series())
