@@ -84,7 +84,7 @@ def write_all(folder: Folder, outcome: Fit | Closing | Posterior, result: dict[s
 
         folder.write(DRAWS, netcdf(outcome))
     describe_model(as_model(outcome), result, folder)
-    played = cache(lambda: play(as_model(outcome)))
+    played = cache(lambda: play(outcome))
     return write_pages(folder, result, pictures_of(outcome, played), lambda: explorable(played()))
 
 

@@ -26,7 +26,7 @@ from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import joint_names
 from sysid_btr.objectives.targets import COMPARED
-from sysid_btr.report.bodies import bodies_of, placed
+from sysid_btr.report.bodies import MOST_FACES, bodies_of, placed
 from sysid_btr.report.explore import MOST_NUMBERS, NEXT, explorable, explorer, next_step
 from sysid_btr.report.guide import about_verdict
 from sysid_btr.report.pictures import write_pages
@@ -150,6 +150,12 @@ def test_shapes_are_closed_and_as_large_as_they_should_be() -> None:
     box = found["box"].vertices
     assert box.min(axis=0) == pytest.approx([0.8, -0.1, -0.3])
     assert box.max(axis=0) == pytest.approx([1.2, 0.1, 0.3])
+
+
+def test_a_robot_of_many_parts_is_drawn_coarser() -> None:
+    parts = "".join(f'<geom size="{0.1 + 0.01 * k}" pos="{k} 0 0"/>' for k in range(60))
+    (body,) = bodies_of(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody><body>{parts}</body></worldbody></mujoco>"))
+    assert 60 * 10 < len(body.faces) <= MOST_FACES
 
 
 def test_bodies_are_placed_by_every_kind_of_joint() -> None:

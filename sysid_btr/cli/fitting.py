@@ -13,7 +13,7 @@ from sysid_btr.cli.options import deciding
 from sysid_btr.cli.terminal import print_result, remark
 from sysid_btr.errors import InterruptedRun, LostCluster, UsageError
 from sysid_btr.progress import Interrupted, ProgressLine
-from sysid_btr.run_folder import Folder, open_folder
+from sysid_btr.run_folder import EXPLORER, Folder, open_folder
 from sysid_btr.saving import as_model, write_all
 from sysid_btr.version import __version__
 
@@ -139,7 +139,8 @@ class Run:
         if folder is None:
             describe_model(as_model(outcome), result)
             return
-        remark(f"report: {write_all(folder, outcome, result)}")
+        report = write_all(folder, outcome, result)
+        remark(f"report: {report}{f'; to explore: {folder.path / EXPLORER}' if 'explore' in result else ''}")
         if self.options.render:
             _draw(folder, as_model(outcome), result)
 

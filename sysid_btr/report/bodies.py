@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     import mujoco
 
 ROUND, RING, DETAIL = 40, 14, 80
-"""Points of a ball, points of a cylinder's rim, and directions in which a mesh keeps its outermost point."""
+"""Points of a ball, points of a cylinder's rim, and directions in which a mesh keeps its outermost point, at most."""
+MOST_FACES, FEWEST_POINTS = 3000, 14
+"""Of all bodies together, which a browser draws 20 times a second, and of one geometry, however many there are."""
 SHOWN_GROUPS = 3
 """Groups of geometry that MuJoCo's viewer shows: those below this one."""
 
@@ -43,9 +45,13 @@ def bodies_of(model: mujoco.MjModel) -> tuple[Body, ...]:
     moving = np.flatnonzero((model.geom_bodyid > 0) & (model.geom_rgba[:, 3] > 0))
     shown = moving[model.geom_group[moving] < SHOWN_GROUPS]
     chosen = shown if len(shown) else moving
+    # a hull of n points has 2 n - 4 triangles
+    points = int(max(MOST_FACES / (2 * max(len(chosen), 1)), FEWEST_POINTS))
     found = []
     for number in np.unique(model.geom_bodyid[chosen]):
-        hulls = [h for g in chosen[model.geom_bodyid[chosen] == number] if (h := _hull(model, int(g))) is not None]
+        hulls = [
+            h for g in chosen[model.geom_bodyid[chosen] == number] if (h := _hull(model, int(g), points)) is not None
+        ]
         if hulls:
             starts = np.cumsum([0, *(len(vertices) for vertices, _ in hulls)])
             vertices = np.concatenate([vertices for vertices, _ in hulls])
@@ -75,12 +81,12 @@ def filled(column: FloatArray | None, instead: FloatArray) -> FloatArray:
     return np.interp(np.arange(len(column)), good, column[good])
 
 
-def _hull(model: mujoco.MjModel, geom: int) -> tuple[FloatArray, IntArray] | None:
-    """Vertices in the body's frame, and faces; None of what has no volume."""
+def _hull(model: mujoco.MjModel, geom: int, most: int) -> tuple[FloatArray, IntArray] | None:
+    """At most so many vertices in the body's frame, and faces; None of what has no volume."""
     import mujoco
     from scipy.spatial import ConvexHull, QhullError
 
-    points = _points(model, geom)
+    points = _points(model, geom, most)
     if points is None:
         return None
     try:
@@ -96,22 +102,22 @@ def _hull(model: mujoco.MjModel, geom: int) -> tuple[FloatArray, IntArray] | Non
     return points[used] @ turn.reshape(3, 3).T + model.geom_pos[geom], faces.reshape(-1, 3)
 
 
-def _points(model: mujoco.MjModel, geom: int) -> FloatArray | None:
-    """Points (n, 3) whose hull a geometry is, in its own frame; None of what is not bounded."""
+def _points(model: mujoco.MjModel, geom: int, most: int) -> FloatArray | None:
+    """Points (n, 3) whose hull a geometry nearly is, in its own frame; None of what is not bounded."""
     import mujoco
 
-    kind, size = mujoco.mjtGeom, model.geom_size[geom]
+    kind, size, ball = mujoco.mjtGeom, model.geom_size[geom], _ball(min(ROUND, most - most % 2))
     match model.geom_type[geom]:
         case kind.mjGEOM_SPHERE:
-            return np.asarray(_ball(ROUND) * size[0])
+            return np.asarray(ball * size[0])
         case kind.mjGEOM_ELLIPSOID:
-            return np.asarray(_ball(ROUND) * size)
+            return np.asarray(ball * size)
         case kind.mjGEOM_CAPSULE:
-            ball = _ball(ROUND)
             return np.asarray(ball * size[0] + np.sign(ball[:, 2:]) * (0.0, 0.0, size[1]))
         case kind.mjGEOM_CYLINDER:
-            angle = np.arange(RING) * 2 * np.pi / RING
-            rim = np.column_stack([np.cos(angle), np.sin(angle), np.ones(RING)])
+            ring = min(RING, most // 2)
+            angle = np.arange(ring) * 2 * np.pi / ring
+            rim = np.column_stack([np.cos(angle), np.sin(angle), np.ones(ring)])
             return np.asarray(np.concatenate([rim, rim * (1, 1, -1)]) * (size[0], size[0], size[1]))
         case kind.mjGEOM_BOX:
             return np.asarray(size * np.array(list(_corners())))
@@ -119,7 +125,7 @@ def _points(model: mujoco.MjModel, geom: int) -> FloatArray | None:
             mesh = int(model.geom_dataid[geom])
             first = int(model.mesh_vertadr[mesh])
             vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])].astype(np.float64)
-            return np.asarray(vertices[np.unique(np.argmax(vertices @ _ball(DETAIL).T, axis=0))])
+            return np.asarray(vertices[np.unique(np.argmax(vertices @ _ball(min(DETAIL, most)).T, axis=0))])
     return None
 
 

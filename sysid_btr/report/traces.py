@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sysid_btr.identify.episode import Episode
     from sysid_btr.identify.fit import Fit
     from sysid_btr.identify.study import Study
+    from sysid_btr.posterior.outcome import Posterior
     from sysid_btr.simulation.replay import Replay
     from sysid_btr.terms.base import Outputs
 
@@ -122,12 +123,14 @@ def trace_outcome(outcome: Fit | Closing) -> tuple[Trace, ...]:
     return play(outcome).worst()
 
 
-def play(outcome: Fit | Closing) -> Played:
-    """Replay the held-out episodes of a fit or a closing under each model, from the plain to the final one."""
+def play(outcome: Fit | Closing | Posterior) -> Played:
+    """Replay the held-out episodes of an outcome under each model, from the plain to the final one."""
+    from sysid_btr.diagnosis.closing import Closing
     from sysid_btr.identify.fit import Fit
 
-    if isinstance(outcome, Fit):
-        models = {"plain model": Model.of(outcome.model.terms), "fitted": outcome.model}
+    if not isinstance(outcome, Closing):
+        final = "fitted" if isinstance(outcome, Fit) else "posterior mean"
+        models = {"plain model": Model.of(outcome.model.terms), final: outcome.model}
         return _play(outcome.study, models, "plain model")
     models = {"plain model": Model.of(()), "parameters fitted": outcome.before_model}
     if outcome.effects:
