@@ -34,8 +34,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.choice import pool_of
 from sysid_btr.btr.controllers import Controller, NaoGait
+from sysid_btr.btr.learning import model_fit
 from sysid_btr.btr.loop import back_to_reality
-from sysid_btr.btr.map_problem import model_fit
 from sysid_btr.btr.outlook import Imagination
 from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.robot import Trial
@@ -161,6 +161,7 @@ def in_the_loop(change: Mapping[str, Any]) -> Callable[[DrakeRobot, int, Plan, P
             threads=1,
             say=lambda text: print(f"  {text}", flush=True),
         )
+        (folder / "result.json").write_text(to_json(outcome.to_dict()))
         return [shot(t.trial, asdict(t.foreseen) if t.foreseen else None, t.expected) for t in outcome.tried]
 
     return run

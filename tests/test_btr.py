@@ -6,30 +6,32 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.choice import Choice, Offer, Pool, disagreement, fittest, pool_of
-from sysid_btr.btr.closing import Joined, _tell_apart, join_effects
+from sysid_btr.btr.closing import Joined
 from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
+from sysid_btr.btr.learning import Learnt, model_fit
 from sysid_btr.btr.loop import back_to_reality, disengaged
-from sysid_btr.btr.map_problem import MapProblem, model_fit
 from sysid_btr.btr.outcome import BackToReality, Iteration, estimate_model
 from sysid_btr.btr.problems import ControllerProblem, ModelProblem, Stage
-from sysid_btr.btr.robot import SILENT, HiddenRobot, Noise, Robot, Trial
+from sysid_btr.btr.robot import HiddenRobot, Noise, Robot, Trial
 from sysid_btr.btr.settings import Settings
-from sysid_btr.btr.study import early_logs, trial_study
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.cli import run
 from sysid_btr.errors import InterruptedRun, UsageError
 from sysid_btr.estimators import CmaEs, GeneticAlgorithm, Record
-from sysid_btr.identify.refit import judge
+from sysid_btr.identify.episode import FixedEpisode
+from sysid_btr.identify.study import Study
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.validation import validate_log
@@ -42,7 +44,6 @@ from sysid_btr.result import to_json
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import BatchModel, Term
-from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Model, Terms
 from sysid_btr.terms.servo import CommandDelay
@@ -335,37 +336,6 @@ def test_the_loop_improves_the_gait_and_finds_the_model() -> None:
     assert all(e.std < 0.3 for e in found)
 
 
-LEAST = replace(TINY, models=model_fit(), distance="likelihood", memory=4)
-
-
-def test_a_likelihood_finds_the_model_in_the_trials_first_seconds() -> None:
-    outcome = tiny(hidden(), settings=LEAST)
-    assert np.abs(outcome.model / TRUTH - 1).max() < 0.01
-    # the second round's trials are predicted by what the first round's corrected, better than by the model as it was
-    tried = outcome.iterations[1].tried
-    plain = outcome.stage.fitness(np.array([t.controller.values for t in tried]), np.ones((1, 2)))[0]
-    error = np.abs(plain - [t.trial.fitness for t in tried]).mean()
-    assert outcome.iterations[1].transfer < 0.5 * error
-    with pytest.raises(UsageError, match="likelihood"):
-        replace(LEAST, distance="phi1")
-
-
-def test_what_trials_do_not_tell_stays_as_it_was() -> None:
-    controller = some_controllers(1)[0]
-    log = hidden().run(Controller(controller)).log
-    assert log is not None
-    unseen = parse_parameters(["damping:LFCoxa"], MODEL)[0]
-    free = (*terms(), replace(unseen, places=("LFCoxa",)))
-    start = np.array([1.1, 0.9, Terms(free).nominal[2]])
-    problem = MapProblem(trial_study(stage(), [log], [], 1).train_problem(Model.of(free, start)))
-    candidates = np.vstack([start, start + problem.width])
-    residuals = problem.residuals(candidates)
-    np.testing.assert_allclose(residuals[:, -3:], [[0, 0, 0], [1, 1, 1]], atol=1e-12)
-    np.testing.assert_allclose(problem.loss(candidates), (residuals**2).sum(axis=1))
-    np.testing.assert_allclose(residuals[:, :-3], problem.problem.residuals(candidates))
-    assert np.isnan(problem.residuals(np.full((1, 3), np.nan))).all()
-
-
 @pytest.fixture(scope="module")
 def whole() -> BackToReality:
     """A tiny run that nothing disturbed."""
@@ -405,6 +375,49 @@ IMPROVING = replace(TINY, choice="improvement", draws=2)
 def improved() -> BackToReality:
     """A tiny run whose trials are chosen one after the other."""
     return tiny(hidden(), settings=IMPROVING)
+
+
+LEAST = replace(IMPROVING, models=model_fit(), distance="likelihood")
+LATE = CommandDelay(places=tuple(SPACE.joints), shared=True)
+
+
+@pytest.mark.parametrize("settings", [LEAST, replace(LEAST, draws=1, choice="fittest")], ids=["drawn", "one model"])
+@pytest.mark.parametrize("explained", [True, False])
+def test_the_model_is_what_a_likelihood_says_where_that_explains_the_trials(
+    settings: Settings, explained: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    def learn(kept: Path, robot: RobotModel, trials: list[Trial], known: Terms, belief: Belief, *_: object) -> Learnt:
+        asked.append((trials, known.names, belief))
+        found = replace(belief, mean=np.array([*TRUTH, 0.01]), covariance=0.25 * belief.covariance)
+        return Learnt(found if explained else belief, 4.0, 1.0 if explained else 3.9, explained, 10)
+
+    monkeypatch.setattr("sysid_btr.btr.loop.learnt_once", learn)
+    said: list[str] = []
+    outcome = tiny(hidden(), tmp_path, settings, say=said.append)
+    assert [len(trials) for trials, *_ in asked] == [2, 2]
+    assert asked[0][1] == ("length:LFFemur", "length:RFTibia", *Terms((LATE,)).names)
+    # each trial once; what was learnt from those before is what is believed of them
+    assert not {id(t) for t in asked[0][0]} & {id(t) for t in asked[1][0]}
+    content = outcome.to_dict()
+    assert same(tiny(hidden(), tmp_path, settings), outcome)
+    if explained:
+        np.testing.assert_array_equal(asked[1][2].mean, [*TRUTH, 0.01])
+        np.testing.assert_array_equal(outcome.model, [*TRUTH, 0.01])
+        assert content["parameters"][0]["value"] == TRUTH[0]
+        assert content["parameters"][0]["std"] == pytest.approx(0.25 * asked[0][2].std[0])
+        assert sum("after correction of the model" in text for text in said) == 2
+    else:
+        np.testing.assert_array_equal(asked[1][2].mean, asked[0][2].mean)
+        np.testing.assert_array_equal(outcome.model, [1.0, 1.0])
+        assert sum("in the model as it is" in text for text in said) == 2
+    assert len(draw_btr(content)) > 10_000
+
+
+def test_least_squares_minimise_a_likelihood() -> None:
+    with pytest.raises(UsageError, match="likelihood"):
+        replace(LEAST, distance="phi1")
 
 
 @pytest.mark.parametrize("dies_in", [2, 3])
@@ -507,7 +520,10 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
         asked.append(len(tried))
         if len(asked) > 1:
             return Joined("nothing more"), None
-        study = trial_study(own, early_logs(own, tried, 1), (), n)
+        log = tried[0].trial.log
+        assert log is not None
+        seen = FixedEpisode(MODEL, log, np.ones(len(log), dtype=bool))
+        study = Study(MODEL, (seen,), (), ("position",), own.world.numerics, np.nan)
         return Joined("20 ms of delay", Model.of((*declared, delay), [1.1, 0.9, 0.02])), study
 
     monkeypatch.setattr("sysid_btr.btr.closing._look", look)
@@ -528,47 +544,6 @@ def test_an_effect_that_is_named_joins_the_model(disk: bool, tmp_path: Path, mon
         assert len(asked) == 2
 
 
-def test_a_trial_is_replayed_as_it_was_made() -> None:
-    log = hidden(SILENT).run(Controller(some_controllers(1)[0])).log
-    assert log is not None
-    problem = trial_study(stage(), [log], [log], 1).train_problem(Model.of(terms(), np.ones(2)))
-    ((_, outputs),) = problem.episodes[0].replay.chunks(TRUTH[None])
-    assert np.array_equal(problem.episodes[0].targets[0].predicted(outputs)[0], problem.episodes[0].targets[0].measured)
-    # the part that a shorter log has, and trials together
-    half = trial_study(stage(), [log.window(0, 26), log], [log], 1).train_problem(Model.of(terms(), np.ones(2)))
-    assert half.residuals(TRUTH[None]).shape == (1, (26 + 51) * 18)
-    assert np.abs(half.residuals(TRUTH[None])).max() == 0
-
-
-def test_trials_that_lasted_are_looked_at_whether_they_fell_later_or_not() -> None:
-    trial = hidden().run(Controller(some_controllers(1)[0]))
-    assert trial.log is not None
-    fallen, short = replace(trial, outcome="fallen"), replace(trial, log=trial.log.window(0, 20), outcome="fallen")
-    tried = [Tried(1, Controller(SPACE.start), 0.0, t) for t in (trial, fallen, short, Trial(None, 0.0, "crashed"))]
-    assert early_logs(stage(), tried, 4) == [trial.log, fallen.log]
-    assert early_logs(stage(), tried, 1) == [fallen.log]
-
-
-def test_a_model_that_spoils_the_whole_trials_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sysid_btr.btr.loop.SPOILT", 0.0)
-    outcome = tiny(hidden(), settings=LEAST)
-    assert [i.model.tolist() for i in outcome.iterations] == [[1.0, 1.0]] * 2
-
-
-def test_effects_are_found_in_trials_of_a_robot_that_stands_on_its_own() -> None:
-    delay = CommandDelay(places=tuple(SPACE.joints), shared=True)
-    world = make_world(MODEL, TASK, (*terms(), delay), threads=1)
-    late = HiddenRobot(world, np.array([*TRUTH, 0.03]), TASK, SPACE, Noise())
-    tried = [Tried(1, Controller(c), 0.0, late.run(Controller(c))) for c in 0.5 * some_controllers(2)]
-    joined = join_effects(stage(), np.ones(2), tried, None, 1)
-    assert joined.model is not None
-    named = [m for m in joined.model.terms if isinstance(m, Effect)]
-    assert [m.name for m in named] in (["command_delay"], ["sensor_delay"])
-    assert abs(joined.model.values[-1] - 0.03) < 0.002
-    assert np.all(np.abs(joined.model.values[:2] - TRUTH) < np.abs(1 - TRUTH))
-    assert joined.simulations > 10
-
-
 def tied() -> RobotModel:
     """The ant with two hips that mirror each other, which those of `hidden` do not."""
 
@@ -580,7 +555,7 @@ def tied() -> RobotModel:
     return replace(MODEL, make_spec=spec)
 
 
-@pytest.mark.parametrize("settings", [TINY, IMPROVING, LEAST], ids=["one model", "drawn models", "likelihood"])
+@pytest.mark.parametrize("settings", [TINY, IMPROVING], ids=["one model", "drawn models"])
 def test_a_tie_that_the_robot_lacks_is_left_out_once_trials_show_it(settings: Settings, tmp_path: Path) -> None:
     said: list[str] = []
     outcome = back_to_reality(
@@ -606,28 +581,6 @@ def test_a_tie_that_the_robot_has_stays() -> None:
     outcome = back_to_reality(tied(), terms(), robot, SPACE, task=TASK, settings=TINY, threads=1)
     assert outcome.stage.world.model.neq == 1
     assert not any(i.untied for i in outcome.iterations)
-
-
-@pytest.mark.parametrize("apart", [True, False])
-def test_an_effect_has_amounts_of_its_own_where_held_out_trials_want_that(apart: bool) -> None:
-    places = tuple(SPACE.joints)
-    delays = np.where([apart and j.startswith("R") for j in places], 0.04, 0.02)
-    world = make_world(MODEL, TASK, (*terms(), CommandDelay(places=places)), threads=1)
-    late = HiddenRobot(world, np.array([*TRUTH, *delays]), TASK, SPACE, Noise())
-    logs = [late.run(Controller(c)).log for c in 0.4 * some_controllers(4)]
-    assert all(log is not None for log in logs)
-    study = trial_study(stage(), [log for log in logs[:2] if log], [log for log in logs[2:] if log], 1)
-    shared = CommandDelay(places=places, shared=True)
-    alike = Model.of((*terms(), shared), [*TRUTH, delays.mean()])
-    left = judge(study, alike).holdout
-    found, holdout, spent = _tell_apart(study, alike, len(terms()), left)
-    assert spent > 1
-    assert found.terms[-1].shared is not apart
-    if apart:
-        assert holdout < 0.2 * left
-        assert np.abs(found.own(found.terms[-1]) - delays).max() < 0.005
-    else:
-        assert (holdout, found) == (left, alike)
 
 
 def rounds(best: Sequence[float], real: Callable[[float], float]) -> list[Iteration]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,6 +44,30 @@ def test_beliefs_beside_each_other_are_independent() -> None:
     both = belief(0.5, [[0.04]]).beside(belief(0.5, [[0.09]], 1.2))
     np.testing.assert_array_equal(both.mean, [1.0, 1.2])
     np.testing.assert_array_equal(both.covariance, [[0.04, 0.0], [0.0, 0.09]])
+
+
+def test_what_is_learnt_of_some_parameters_moves_those_that_are_tied_to_them() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(3, 3))
+    known = replace(belief(50.0, (root @ root.T).tolist()), mean=rng.normal(size=3))
+    rows = np.array([0, 2])
+    own = known.of(rows)
+    np.testing.assert_array_equal(own.covariance, known.covariance[np.ix_(rows, rows)])
+    same = known.after(rows, own.mean, own.covariance)
+    np.testing.assert_allclose(same.mean, known.mean)
+    np.testing.assert_allclose(same.covariance, known.covariance, atol=1e-12)
+    # as by Bayes' rule with a measurement of those two
+    noise, seen = np.diag([0.5, 0.2]), rng.normal(size=2)
+    gain = known.covariance[:, rows] @ np.linalg.inv(own.covariance + noise)
+    mean = known.mean + gain @ (seen - own.mean)
+    cov = known.covariance - gain @ known.covariance[rows]
+    after = known.after(rows, mean[rows], cov[np.ix_(rows, rows)])
+    np.testing.assert_allclose(after.mean, mean)
+    np.testing.assert_allclose(after.covariance, cov, atol=1e-12)
+    np.testing.assert_allclose(
+        np.sum(known.whitened(mean[None]) ** 2),
+        (mean - known.mean) @ np.linalg.solve(known.covariance, mean - known.mean),
+    )
 
 
 def test_numbers_that_do_not_belong_to_the_parameters_are_refused() -> None:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.models.robot import Robot
 from sysid_btr.terms.base import Parameter, Term
+from sysid_btr.terms.effect import GROUND
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
@@ -64,19 +65,21 @@ class Belief:
         return cls(found.parameters, found.nominal, np.diag((width * found.scale) ** 2))
 
     @classmethod
-    def unmeasured(cls, robot: Robot, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Belief]:
+    def unmeasured(cls, robot: Robot, terms: Sequence[Term], ground: bool = True) -> tuple[tuple[Term, ...], Belief]:
         """What may differ beside the terms of a model, and how much: the ground, and late commands.
 
         Parameters
         ----------
         robot : that has it.
         terms : of the model; what is among them is not there twice.
+        ground : whether the ground is asked for, too.
         """
         there = {term.name for term in terms}
         found: list[Term] = []
         for effect in select_effects([name for name in UNMEASURED if name not in there] or ["all"]):
             places = robot.names(effect.scope)
-            if effect.name in UNMEASURED and effect.name not in there and places:
+            asked = effect.name in UNMEASURED and (ground or effect.needs != GROUND)
+            if asked and effect.name not in there and places:
                 found.append(effect(places=places, shared=len(places) > 1))
         std = np.array([UNMEASURED[term.name] for term in found for _ in term.parameters])
         listed = Terms(found)
@@ -95,6 +98,24 @@ class Belief:
     def std(self) -> FloatArray:
         """(p,) standard deviations, without regard to the bounds."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def of(self, rows: IntArray) -> Belief:
+        """Of some of the parameters, by position (k,), whatever the others are."""
+        return Belief(tuple(self.parameters[i] for i in rows), self.mean[rows], self.covariance[np.ix_(rows, rows)])
+
+    def after(self, rows: IntArray, mean: FloatArray, covariance: FloatArray) -> Belief:
+        """The belief once more is known of some of the parameters, (k,) and (k, k): of the others by what ties them."""
+        gain = np.linalg.solve(self.covariance[np.ix_(rows, rows)], self.covariance[rows]).T
+        return replace(
+            self,
+            mean=self.mean + gain @ (mean - self.mean[rows]),
+            covariance=self.covariance + gain @ (covariance - self.covariance[np.ix_(rows, rows)]) @ gain.T,
+        )
+
+    def whitened(self, candidates: FloatArray) -> FloatArray:
+        """(m, p) by how many standard deviations candidates (m, p) are off, in independent directions."""
+        root = np.linalg.cholesky(self.covariance)
+        return np.asarray(np.linalg.solve(root, (candidates - self.mean).T).T)
 
     def beside(self, other: Belief) -> Belief:
         """Both, independent of each other."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.trials import Tried
 from sysid_btr.errors import SysidError
-from sysid_btr.estimators.base import Budget, Progress, Termination, silent
-from sysid_btr.estimators.journal import Journal
+from sysid_btr.estimators.base import Progress, silent
 from sysid_btr.models.robot import Robot
 from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import Folder
@@ -25,17 +24,13 @@ from sysid_btr.terms.model import Model
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
 
-LOGS, FEWEST = 4, 2
-"""Trials that are looked at, half of them held out, at most and at least."""
+FEWEST = 2
+"""Trials that are looked at, at least: what is named must hold for one that was not fitted."""
 EXPLAINED = 3.0
-"""Position error, in noise floors, of trials, and of their beginnings, up to which nothing is looked for."""
-SAME = ("sensor_delay",)
-"""Effects not asked for: commands that are played from rest do not distinguish a late encoder from a late command."""
-MINIMUM_GAIN, ROUNDS = 0.05, 2
-"""Fraction of some joint's error that an effect must explain to join the model, and effects that join at once."""
-LEFT = 0.75
-"""Fraction of the held-out mean squared error that effects may leave, to join, and that amounts of their own at every
-place may leave of what one for all leaves."""
+"""Position error, in noise floors, of trials up to which nothing is looked for where a model is fitted to them as
+wholes."""
+EXPLAINING = ("explained", "ambiguous")
+"""Verdicts with which effects join: if several explain the same, any of them foresees it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +41,7 @@ class Joined:
     ----------
     message : in words.
     model : with the effects; None where none was named.
-    simulations : of beginnings of trials, that it took.
+    simulations : of trials' samples, that it took.
     """
 
     message: str
@@ -93,92 +88,27 @@ def join_effects(
 def _look(
     stage: Stage, values: FloatArray, tried: Sequence[Tried], threads: int, progress: Progress
 ) -> tuple[Joined, Study | None]:
-    """Look for effects that are the same all over the robot, with bodies as they are and drives free.
-
-    Few trials of one gait do not distinguish masses or lengths from anything else: free, they take the place of what
-    is missing. Step 3 corrects them afterwards. An effect joins if trials that were not fitted say so, even if more is
-    missing.
-    """
-    from sysid_btr.btr.study import early_logs, trial_study
+    """What `close` says of the longest trials, half of them held out; what it names joins if it explains them."""
+    from sysid_btr.btr.learning import trial_study, usable_logs
     from sysid_btr.diagnosis.close import close
-    from sysid_btr.diagnosis.selection import Selection
-    from sysid_btr.identify.refit import judge
-    from sysid_btr.terms.library import select_effects
 
-    logs = early_logs(stage, tried, LOGS)
-    logs = logs[len(logs) % 2 :]  # as many fitted as held out
+    logs = usable_logs([t.trial for t in tried])
     if len(logs) < FEWEST:
-        message = "missing effects were not searched for: fewer than two trials have a log of their first seconds"
-        return Joined(message), None
+        return Joined("missing effects were not searched for: fewer than two trials have a log"), None
     declared = Model.of(stage.world.terms, values)
-    drives = [term for term in declared.terms if term.location != "body"] or list(declared.terms)
-    free = declared.only(*drives)
-    effects = tuple(dict.fromkeys(e.name for e in select_effects(("all",)) if e.name not in SAME))
     try:
-        study = trial_study(stage, logs[::2], logs[1::2], threads, declared.without(*drives))
-        now = judge(study, free)
-        error = float(np.sqrt(max(now.train, now.holdout)))
-        if error <= EXPLAINED:
-            message = (
-                "missing effects were not searched for: the model predicts the beginning of the trials within "
-                f"{error:.2g} noise floors"
-            )
-            return Joined(message, simulations=now.evaluations * len(logs)), None
-        closing = close(
-            study,
-            free.terms,
-            effects=effects,
-            start=free.values,
-            selection=Selection(alike=True, minimum_gain=MINIMUM_GAIN, rounds=ROUNDS),
-            progress=progress,
-        )
+        study = trial_study(stage.world.robot, logs[::2], logs[1::2], threads)
+        seen = declared.only(*(term for term in declared.terms if study.shows(type(term))))
+        closing = close(study, seen.terms, start=seen.values, progress=progress)
     except SysidError as error:
         return Joined(f"missing effects could not be searched for: {error}"), None
-    first, last = closing.steps[0].holdout, closing.steps[-1].holdout
     spent = closing.replays * len(logs)
-    if len(closing.model.terms) == len(free.terms) or last > LEFT * first:
-        message = f"no effect improves the prediction enough to be added; {_score(first, last)}"
-        return Joined(message, simulations=spent), None
-    found, last, apart = _tell_apart(study, closing.model, len(free.terms), last)
-    joining, spent = found.without(*free.terms), spent + apart * len(logs)
-    fitted = [(term, found.own(term) if term in found.terms else own) for term, own in declared.parts]
+    joining = closing.model.without(*seen.terms)
+    if not joining.terms or closing.verdict not in EXPLAINING:
+        return Joined(closing.message, simulations=spent), None
+    fitted = [(term, closing.model.own(term) if term in seen.terms else own) for term, own in declared.parts]
     added = "; ".join(f"{m.called} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
-    message = f"added to the model: {added}; {_score(first, last)}"
-    return Joined(message, Model.joined([*fitted, *joining.parts]), spent), study
-
-
-def _tell_apart(study: Study, found: Model, declared: int, left: float) -> tuple[Model, float, int]:
-    """The model with amounts of their own at every place for effects where held-out trials want that.
-
-    The first `declared` terms stay; `left` is the mean squared held-out error so far. Returned with that of the model,
-    and the candidates that it took.
-    """
-    from sysid_btr.btr.map_problem import MapProblem, model_fit
-    from sysid_btr.identify.refit import judge
-
-    spent = 0
-    for effect in found.terms[declared:]:
-        if not effect.shared:
-            continue
-        trying = found.replaced(effect, (_own_amounts(effect), np.tile(found.own(effect), len(effect.places))))
-        problem = MapProblem(study.train_problem(trying))
-        estimate = model_fit().fit(
-            problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=silent
-        )
-        if estimate.termination is Termination.INTERRUPTED:
-            raise KeyboardInterrupt
-        judged = judge(study, trying.at(estimate.x), estimate.evaluations)
-        spent += judged.evaluations
-        if judged.holdout < LEFT * left:
-            found, left = judged.model, judged.holdout
-    return found, left, spent
-
-
-def _own_amounts(effect: Term) -> Term:
-    """The effect with an amount for every place, within the bounds of the one for all."""
-    bare = replace(effect, shared=False, known=())
-    known = (*effect.parameters,) * len(effect.places)
-    return replace(bare, known=tuple(replace(k, name=p.name) for k, p in zip(known, bare.parameters, strict=True)))
+    return Joined(f"added to the model: {added}", Model.joined([*fitted, *joining.parts]), spent), study
 
 
 def _amounts(term: Term, values: FloatArray) -> str:
@@ -189,11 +119,6 @@ def _amounts(term: Term, values: FloatArray) -> str:
         f"{low:.3g} {unit}" if low == high else f"{low:.3g} to {high:.3g} {unit}"
         for low, high, unit in zip(own.min(axis=0), own.max(axis=0), units, strict=False)
     )
-
-
-def _score(before: float, after: float) -> str:
-    """Mean squares over noise floors, in words."""
-    return f"held-out position error {np.sqrt(before):.3g} -> {np.sqrt(after):.3g} noise floors"
 
 
 def _read(summary: dict[str, Any], params: Path, robot: Robot) -> Joined:

@@ -24,14 +24,13 @@ from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
 from sysid_btr.btr.foresight import Foreseen
-from sysid_btr.btr.map_problem import MapProblem
+from sysid_btr.btr.learning import SECONDS, Learnt, learnt_once
 from sysid_btr.btr.outcome import BackToReality, Iteration
 from sysid_btr.btr.outlook import Cloud, Imagination, Outlook
 from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, SearchProblem, Stage
 from sysid_btr.btr.robot import Robot
 from sysid_btr.btr.robust import RobustProblem
-from sysid_btr.btr.settings import LIKELIHOOD, Settings
-from sysid_btr.btr.study import early, early_logs, trial_study
+from sysid_btr.btr.settings import Settings
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.trust import Region
@@ -42,7 +41,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot as RobotModel
 from sysid_btr.models.ties import as_logged
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.model import Model
+from sysid_btr.terms.model import Terms
 from sysid_btr.units import probability
 from sysid_btr.version import __version__
 
@@ -55,8 +54,8 @@ HELD = 0.5
 STUCK = 0.9
 """What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
 
-STEPS = {"models_drawn": 0, "controllers": 1, "outlook": 2, "models": 3, "models_again": 4}
-"""Searches of an iteration by the paper's numbers; with a likelihood Step 3 goes on where effects joined the model."""
+STEPS = {"models_drawn": 0, "controllers": 1, "outlook": 2, "models": 3}
+"""Searches of an iteration by the paper's numbers."""
 SHORTLIST = 3
 """Times as many controllers as are tried, the fittest of Step 1, among which Step 2 chooses."""
 ASSESSED = 2
@@ -64,8 +63,6 @@ ASSESSED = 2
 first few, they do it less well in others."""
 MANY = 6
 """Times as many models are drawn as controllers are searched in; those that do as the robot did are chosen."""
-SPOILT = 1.5
-"""Times the error of the fitness that the last model foresees of the trials, above which a model is not taken."""
 
 
 def back_to_reality(
@@ -143,11 +140,6 @@ class _Loop:
     def _stage(self, terms: tuple[Term, ...]) -> Stage:
         return Stage(make_world(self.model, self.task, terms, threads=self.threads), self.task, self.space)
 
-    @property
-    def _beginning(self) -> float:
-        """What of a trial its beginning is."""
-        return len(early(self.stage)) / len(self.task.time)
-
     def _fingerprint(self) -> str:
         """Digest of all that decides which simulations are run; not of how long the loop goes on."""
         settings = replace(self.settings, iterations=1, requirement=None, worthwhile=None)
@@ -190,6 +182,7 @@ class _Loop:
             seed=self.seed,
             simulations=self.simulations,
             seconds=perf_counter() - began,
+            belief=self.belief if self.settings.by_likelihood else None,
         )
 
     def _round(self, number: int) -> Iteration:
@@ -202,19 +195,68 @@ class _Loop:
         transfer = _mean([abs(t.expected - t.trial.fitness) for t in tried if t.trial.outcome != "crashed"])
         joined, before = "", self.values
         names = tuple(p.name for p in self.stage.parameters)
+        if self.settings.by_likelihood:
+            learnt, joined = self._learn(number)
+            problem = self._model_problem(self._remembered(), self.values)
+            report = self._report(number, found, last, tried, transfer, problem, None, joined)
+            if learnt is not None:
+                report = replace(report, loss_before=learnt.before, loss=learnt.after, learnt=learnt)
+            return replace(report, population_names=problem.names, promise=promise, untied=untied)
         problem = self._model_problem(self._remembered(), before)
         searched = self._search_model(number, problem) if self.settings.learn else None
         if searched is not None and self.settings.close and self._stuck(problem, searched[1]):
-            stage = self.stage
             joined = self._close(number, before)
             if joined:
                 problem = self._model_problem(self._remembered(), self.values)
-                if problem.distance == LIKELIHOOD and self.stage is not stage:
-                    self._search_model(number, problem, "models_again")
         report = self._report(number, found, last, tried, transfer, problem, searched, joined)
         if self.settings.learn:
             self.belief = Belief.before(self.terms).towards(self.values, report.noise)
         return replace(report, population_names=names, promise=promise, untied=untied)
+
+    def _learn(self, number: int) -> tuple[Learnt | None, str]:
+        """Step 3 by a likelihood, and what `close` says, once, where too little is explained."""
+        learnt = self._learnt(number, "learnt")
+        if not self.settings.close or learnt is None or learnt.explained or any(r.joined for r in self.rounds):
+            return learnt, ""
+        before = self.terms, self.stage, self.values, self.belief
+        joined = self._close(number, self.values)
+        if self.stage is before[1]:
+            return learnt, joined
+        # what was declared comes first, and is known as it was
+        rows = np.arange(len(before[2]), len(self.values))
+        self.belief = before[3].beside(replace(Belief.before(self.terms).of(rows), mean=self.values[rows]))
+        again = self._learnt(number, "learnt_again")
+        if again is None or not again.explained:
+            self.terms, self.stage, self.values, self.belief = before
+            self.rivals, joined = self.values[None], f"not {joined}, as it explains too little"
+        return again, joined
+
+    def _learnt(self, number: int, label: str) -> Learnt | None:
+        """What is believed after the trials of an iteration, late commands included."""
+        others, more = Belief.unmeasured(self.model, self.terms, ground=False)
+        terms = Terms((*self.terms, *others))
+        learnt = learnt_once(
+            None if self.folder is None else self.folder / "learnt" / f"{number:02d}_{label}.json",
+            self.model,
+            [t.trial for t in self.book.of(number)],
+            terms,
+            self.belief.beside(more),
+            self.settings.models,
+            self.threads,
+            _noted(self.progress, f"iteration {number}, {label}"),
+        )
+        if learnt is not None:
+            self.simulations += round(learnt.simulations * self._looked_at)
+        if learnt is not None and learnt.explained:
+            self.terms, self.belief, self.values = tuple(terms), learnt.belief, learnt.belief.mean
+            self.stage = self._stage(self.terms)
+            self.rivals = self.values[None]
+        return learnt
+
+    @property
+    def _looked_at(self) -> float:
+        """What of a trial its logs are compared for."""
+        return min(SECONDS / self.task.duration, 1.0)
 
     def _imagine(self, number: int) -> Imagination:
         """Models drawn from what is believed after the iterations before, and chosen by what was tried."""
@@ -323,28 +365,15 @@ class _Loop:
         controllers = np.array([t.controller.values for t in tried]).reshape(len(tried), width)
         return ModelProblem(self.stage, controllers, [t.trial for t in tried], self.settings.distance, start)
 
-    def _search_model(
-        self, number: int, problem: ModelProblem, step: str = "models"
-    ) -> tuple[FloatArray, Journal] | None:
+    def _search_model(self, number: int, problem: ModelProblem) -> tuple[FloatArray, Journal] | None:
         """Step 3; None where there is nothing to explain, or the model stays as it is."""
         if self.settings.correct or not problem.trials:
             return None
         if problem.distance != FITNESS and not problem.targets:
             return None
-        asked: ModelProblem | MapProblem = problem
-        if problem.distance == LIKELIHOOD:
-            logs = early_logs(self.stage, self._remembered(), self.settings.memory)
-            if not logs:
-                return None
-            study = trial_study(self.stage, logs, (), self.threads)
-            asked = MapProblem(study.train_problem(Model.of(self.stage.world.terms, problem.start)), self._beginning)
-        found, journal = self._search(number, step, self.settings.models, asked)
+        found, journal = self._search(number, "models", self.settings.models, problem)
         if not np.isfinite(found.loss):
             return None
-        if problem.distance == LIKELIHOOD:
-            last, new = replace(problem, distance=FITNESS).loss(np.stack([problem.start, found.x]))
-            if not np.isfinite(new) or new > SPOILT * last:
-                return problem.start, journal  # what comes later in the trials speaks against it
         self.values = found.x
         candidates, losses = _all_of(journal)
         order = np.argsort(losses, kind="stable")
@@ -386,7 +415,7 @@ class _Loop:
         kept = None if self.folder is None else self.folder / "closings" / f"{number:02d}.json"
         noted = _noted(self.progress, f"iteration {number}, closing")
         joined: Joined = join_effects(self.stage, values, self.book.made, kept, self.threads, noted)
-        self.simulations += round(self._beginning * joined.simulations)
+        self.simulations += round(self._looked_at * joined.simulations)
         if joined.model is not None:
             self.terms = joined.model.terms
             self.stage = self._stage(self.terms)
@@ -514,7 +543,7 @@ def _told(t: Tried, foreseen: Foreseen) -> str:
 
 def _line(r: Iteration) -> str:
     fell = sum(t.trial.outcome != "done" for t in r.tried)
-    model = "after correction of the model" if np.isfinite(r.loss) else "in the model as it is"
+    model = "after correction of the model" if r.corrected else "in the model as it is"
     parts = [
         f"iteration {r.number}: {len(r.tried)} trials" + (f" ({fell} fell or crashed)" if fell else ""),
         f"best on the robot {r.best:.4g} m/s",
@@ -523,4 +552,6 @@ def _line(r: Iteration) -> str:
     ]
     if r.promise is not None:
         parts.append(f"a trial promised {r.promise:.2g} m/s")
-    return "; ".join([", ".join(parts), *r.untied, *([r.joined] if r.joined else [])])
+    return "; ".join(
+        [", ".join(parts), *r.untied, *([r.joined] if r.joined else []), *([] if r.learnt is None else [str(r.learnt)])]
+    )

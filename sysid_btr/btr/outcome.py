@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.btr.belief import Belief
+from sysid_btr.btr.learning import Learnt
 from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.settings import Settings
 from sysid_btr.btr.trials import Tried
 from sysid_btr.identify.intervals import Estimate, estimates
+from sysid_btr.objectives.covariance import Known
 from sysid_btr.result import SCHEMA, clean, versions
 from sysid_btr.terms.base import Parameter
 
@@ -46,6 +49,7 @@ class Iteration:
     promise : what the first trial was worth beforehand, m/s: the gain to be expected, times the chance to stand; None
         where one model chose. Nothing is tried where that is less than is worthwhile.
     untied : a remark on each tie of joints that the trials so far contradict, and that is left out of the model.
+    learnt : what Step 3 learnt by a likelihood, if that was asked for.
     """
 
     number: int
@@ -68,6 +72,12 @@ class Iteration:
     promise: float | None = None
     population_names: tuple[str, ...] = ()
     untied: tuple[str, ...] = ()
+    learnt: Learnt | None = None
+
+    @property
+    def corrected(self) -> bool:
+        """Whether Step 3 corrected the model."""
+        return bool(np.isfinite(self.loss)) if self.learnt is None else self.learnt.explained
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +94,7 @@ class BackToReality:
     settings, seed : as given.
     simulations : of whole trials, in Steps 1 and 3 and where effects were looked for.
     seconds : wall time of this run.
+    belief : of the best model, where it was corrected by a likelihood.
     """
 
     stage: Stage
@@ -96,6 +107,7 @@ class BackToReality:
     seed: int
     simulations: int
     seconds: float
+    belief: Belief | None = None
 
     @property
     def tried(self) -> tuple[Tried, ...]:
@@ -149,7 +161,9 @@ class BackToReality:
                     "controllers": repr(self.settings.controllers),
                     "models": repr(self.settings.models),
                 },
-                "intervals": "linearised fitness of the newest trials, widened by the remaining step to the optimum",
+                "intervals": "linearised fitness of the newest trials, widened by the remaining step to the optimum"
+                if self.belief is None
+                else "what was believed beforehand and the likelihood of the trials' logs, linearised",
                 "units": {"fitness": "m/s"},
                 "numerics": {
                     "integrator": world.numerics.integrator,
@@ -189,12 +203,18 @@ class BackToReality:
 
 
 def estimate_model(outcome: BackToReality) -> tuple[Estimate, ...]:
-    """The model's parameters with intervals, from the derivatives of the newest trials' fitness.
+    """The model's parameters with intervals: as they are believed, or from the newest trials' fitness.
 
     The search that ended here may not have converged, so the step to the optimum of the linearised problem widens
     the intervals. They assume that the model is right but for what the fitness differs by.
     """
     stage, values = outcome.stage, outcome.model
+    if outcome.belief is not None:
+        spread, every = outcome.belief.covariance, np.arange(len(values))
+        root = np.linalg.inv(np.linalg.cholesky(spread))
+        return estimates(
+            stage.parameters, values, root, np.zeros(len(values)), every, known=Known(every, values, spread)
+        )
     tried = [t for t in outcome.tried if t.trial.outcome != "crashed"][-MOST_TRIALS:]
     step = np.array([DIFFERENCE * p.scale for p in stage.parameters])
     lower = np.array([p.lower for p in stage.parameters])
@@ -280,6 +300,7 @@ def _iteration(i: Iteration) -> dict[str, Any]:
         "model": dict(zip(i.names, i.model, strict=True)),
         "models": {"names": i.population_names, "values": i.population, "losses": i.losses},
         "closing": i.joined or None,
+        "learnt": None if i.learnt is None else str(i.learnt),
         "promise": i.promise,
     }
 

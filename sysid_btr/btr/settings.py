@@ -15,7 +15,7 @@ from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.objectives.distance import get_distance
 
 LIKELIHOOD = "likelihood"
-"""The distance by which Step 3 explains the first seconds of trials, and is biased by the last model."""
+"""The distance by which Step 3 compares the sensors sample by sample, whatever the ground does."""
 FLIPS, BITS = 4.3, 8
 """Bits by which a controller's children differ from it on average, and bits of each of its numbers."""
 
@@ -62,8 +62,8 @@ class Settings:
     trials : controllers tried in each (m in the paper); with a distance of sensors one or two will do.
     first, controllers : Step 1 in the first iteration and in the others.
     models : Step 3; least squares needs a likelihood.
-    distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse`` or ``wasserstein`` of whole trials, or the
-        ``likelihood`` of their first seconds, biased by the last model.
+    distance : of Step 3: ``phi1``, ``phi2[:BINS]``, ``mse`` or ``wasserstein`` of whole trials, or the ``likelihood``
+        of their logs whatever the ground does; what earlier trials said is its prior.
     choice : of trials, ``fittest``, ``disagreement`` or ``improvement``.
     draws : models that Step 1 runs controllers in, drawn from what is believed, the ground's softness and friction and
         late commands among it; 1 is the believed model alone, as in the paper.
@@ -108,3 +108,8 @@ class Settings:
         get_choice(self.choice)
         if self.distance != FITNESS:
             get_distance(self.distance)
+
+    @property
+    def by_likelihood(self) -> bool:
+        """Whether the model is corrected by a likelihood."""
+        return self.distance == LIKELIHOOD and self.learn and not self.correct

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sysid_btr.estimators.base import Estimator
     from sysid_btr.models.robot import Robot as Model
 
-KEPT = ("journals", "trials", "closings")
+KEPT = ("journals", "trials", "closings", "learnt")
 """Folders of a run beside its results."""
 DURATIONS, LONG = {"ant": 3.0}, 8.0
 """s of a trial by robot, and of any other."""
@@ -105,7 +105,7 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
     )
     model_search: str | None = option(
         None,
-        "How models are searched for: cmaes, ga (the paper), or lsq, which uses the first 2 s of the trials.",
+        "How models are searched for: cmaes, ga (the paper), or lsq, for a likelihood.",
         otherwise="lsq for a likelihood, else cmaes",
         metavar="NAME",
         decides=True,
@@ -167,7 +167,7 @@ def btr(options: BtrOptions) -> int:
 
 def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
     """How the loop searches."""
-    from sysid_btr.btr.map_problem import model_fit
+    from sysid_btr.btr.learning import model_fit
     from sysid_btr.btr.robust import Risk
     from sysid_btr.btr.settings import (
         LIKELIHOOD,

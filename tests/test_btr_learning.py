@@ -1,0 +1,138 @@
+"""Step 3 by a likelihood: trials on a ground that is not the model's, what is not explained, each trial once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sysid_btr.btr import learning
+from sysid_btr.btr.belief import Belief
+from sysid_btr.btr.controllers import Controller, NaoGait
+from sysid_btr.btr.learning import Learnt, MapProblem, learn, learnt_once, model_fit, trial_study, usable_logs
+from sysid_btr.btr.robot import HiddenRobot, Noise, Trial
+from sysid_btr.btr.task import Walk
+from sysid_btr.btr.world import make_world
+from sysid_btr.estimators.base import silent
+from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import servo_joints
+from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.contact import FootCompliance, FootFriction
+from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Model, Terms
+from sysid_btr.terms.servo import CommandDelay
+
+NAO, TASK, SPACE = load_robot("nao"), Walk(3.0), NaoGait()
+JOINTS = servo_joints(NAO)
+DECLARED = parse_parameters(["mass:Torso", "kp:*=shared"], NAO)
+LATE = CommandDelay(places=JOINTS, shared=True)
+TERMS = Terms((*DECLARED, LATE))
+TRUTH = np.array([1.35, 0.85, 0.02])
+
+
+def robot(*beside: tuple[Term, list[float]]) -> HiddenRobot:
+    """A Nao that differs from its model, on a softer ground and a slippery one, with a step of its own."""
+    ground = (FootCompliance(places=("robot",)), [3.0]), (FootFriction(places=("robot",)), [0.6])
+    truth = Model.joined([*Model.of(TERMS, TRUTH).parts, *ground, *beside])
+    world = replace(make_world(NAO, TASK, truth.terms, threads=1), numerics=Numerics("RK4", 0.002))
+    return HiddenRobot(world, truth.values, TASK, SPACE, Noise())
+
+
+@cache
+def trials(count: int = 2) -> list[Trial]:
+    rng = np.random.default_rng(5)
+    near = SPACE.start + 0.05 * (SPACE.upper - SPACE.lower) * rng.normal(size=(count, len(SPACE.names)))
+    return [robot().run(Controller(np.clip(c, SPACE.lower, SPACE.upper))) for c in near]
+
+
+def before() -> Belief:
+    return Belief.before(DECLARED).beside(Belief.unmeasured(NAO, DECLARED, ground=False)[1])
+
+
+def from_trials(some: list[Trial], belief: Belief) -> Learnt:
+    study = trial_study(NAO, usable_logs(some), threads=1)
+    return learn(study, TERMS, belief, model_fit(), np.random.default_rng(0), silent)
+
+
+@pytest.mark.slow
+def test_a_mass_a_gain_and_a_delay_are_learnt_on_a_ground_that_is_not_the_models() -> None:
+    first = from_trials(trials()[:1], before())
+    second = from_trials(trials()[1:], first.belief)
+    for learnt in (first, second):
+        assert learnt.explained
+        assert learnt.after < learnt.before
+        assert np.all(np.abs(learnt.belief.mean - TRUTH) < 4 * learnt.belief.std)
+    # every trial adds to what is known
+    assert np.all(second.belief.std < first.belief.std)
+    assert np.all(second.belief.std < 0.5 * before().std)
+    assert np.all(np.abs(second.belief.mean - TRUTH) < 0.5 * np.abs(TERMS.nominal - TRUTH))
+
+
+@pytest.mark.slow
+def test_what_the_model_cannot_explain_does_not_move_it() -> None:
+    rubs = CoulombFriction(places=JOINTS), [0.3] * len(JOINTS)
+    learnt = from_trials([robot(rubs).run(Controller(SPACE.start))], before())
+    assert not learnt.explained
+    np.testing.assert_array_equal(learnt.belief.mean, before().mean)
+    np.testing.assert_array_equal(learnt.belief.covariance, before().covariance)
+    assert "stayed" in str(learnt)
+
+
+def test_what_was_believed_counts_as_much_as_it_is_known() -> None:
+    class Line:
+        def residuals(self, x: np.ndarray) -> np.ndarray:
+            return np.where(np.isnan(x).any(axis=1, keepdims=True), np.nan, x[:, :1] - 3.0)
+
+    mixed = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.0], [0.0, 0.0, 1e-4]])
+    belief = replace(before(), mean=np.array([1.1, 0.9, 0.01]), covariance=mixed)
+    problem = MapProblem(Line(), belief)  # type: ignore[arg-type]
+    x = np.array([[1.3, 0.9, 0.02], [1.1, 0.9, 0.01]])
+    np.testing.assert_allclose(problem.residuals(x)[1], [-1.9, 0, 0, 0], atol=1e-12)
+    off = x[0] - belief.mean
+    assert problem.loss(x)[0] == pytest.approx(1.7**2 + off @ np.linalg.solve(mixed, off))
+    assert np.isnan(problem.residuals(np.full((1, 3), np.nan))).all()
+
+
+def test_the_longest_trials_are_learnt_from() -> None:
+    trial, other = trials()
+    assert trial.log is not None
+    assert other.log is not None
+    fallen, short = replace(trial, outcome="fallen"), replace(trial, log=trial.log.window(0, 60), outcome="fallen")
+    crashed, silent_one = replace(trial, outcome="crashed"), Trial(None, 0.0)
+    assert [len(log) for log in usable_logs([short, crashed, silent_one, fallen])] == [151, 60]
+    assert [log.content for log in usable_logs([short, fallen, other])] == [trial.log.content, other.log.content]
+    assert usable_logs([crashed]) == []
+    long = replace(trial, log=replace(trial.log, time=2 * trial.log.time))
+    assert len(usable_logs([long])[0]) == 101
+
+
+def test_what_was_learnt_is_not_learnt_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    belief, asked = before(), []
+
+    def once(*given: object) -> Learnt:
+        asked.append(given)
+        return Learnt(replace(belief, mean=TRUTH, covariance=0.1 * belief.covariance), 4.0, 1.01, True, 7)
+
+    monkeypatch.setattr(learning, "learn", once)
+    monkeypatch.setattr(learning, "trial_study", lambda *_, **__: None)
+    given = NAO, trials(), TERMS, belief, model_fit(), 1, silent
+    path = tmp_path / "learnt" / "01.json"
+    first, again = learnt_once(path, *given), learnt_once(path, *given)
+    assert first is not None
+    assert again is not None
+    assert len(asked) == 1
+    np.testing.assert_array_equal(again.belief.mean, TRUTH)
+    np.testing.assert_array_equal(again.belief.covariance, 0.1 * belief.covariance)
+    assert (str(again), again.simulations) == (str(first), 7)
+
+
+def test_without_a_log_nothing_is_learnt() -> None:
+    given = TERMS, before(), model_fit(), 1, silent
+    assert learnt_once(None, NAO, [Trial(None, 0.0, "crashed")], *given) is None
+    short = replace(trials()[0], log=usable_logs(trials())[0].window(0, 20))
+    assert learnt_once(None, NAO, [short], *given) is None
