@@ -55,6 +55,7 @@ def test_what_is_learnt_of_some_parameters_moves_those_that_are_tied_to_them() -
     np.testing.assert_array_equal(own.covariance, known.covariance[np.ix_(rows, rows)])
     same = known.after(rows, own.mean, own.covariance)
     np.testing.assert_allclose(same.mean, known.mean)
+    assert np.array_equal(known.after(rows, np.zeros(2), own.covariance).mean[rows], [0.0, 0.0])
     np.testing.assert_allclose(same.covariance, known.covariance, atol=1e-12)
     # as by Bayes' rule with a measurement of those two
     noise, seen = np.diag([0.5, 0.2]), rng.normal(size=2)

@@ -11,10 +11,13 @@ import pytest
 
 from sysid_btr.btr import learning
 from sysid_btr.btr.belief import Belief
+from sysid_btr.btr.closing import join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait
 from sysid_btr.btr.learning import Learnt, MapProblem, learn, learnt_once, model_fit, trial_study, usable_logs
+from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise, Trial
 from sysid_btr.btr.task import Walk
+from sysid_btr.btr.trials import Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.estimators.base import silent
 from sysid_btr.models.builtin import load_robot
@@ -81,6 +84,17 @@ def test_what_the_model_cannot_explain_does_not_move_it() -> None:
     np.testing.assert_array_equal(learnt.belief.mean, before().mean)
     np.testing.assert_array_equal(learnt.belief.covariance, before().covariance)
     assert "stayed" in str(learnt)
+
+
+@pytest.mark.slow
+def test_close_names_what_is_missing_on_a_ground_that_is_not_the_models() -> None:
+    stage = Stage(make_world(NAO, TASK, DECLARED, threads=1), TASK, SPACE)
+    tried = [Tried(1, Controller(SPACE.start), 0.0, trial) for trial in trials()]
+    joined = join_effects(stage, np.ones(2), tried, None, 1)
+    assert joined.model is not None
+    assert [term.name for term in joined.model.terms] == ["mass", "kp", "command_delay"]
+    assert np.all(np.abs(joined.model.values - TRUTH) < [0.1, 0.05, 0.002])
+    assert join_effects(stage, np.ones(2), tried[:1], None, 1).model is None
 
 
 def test_what_was_believed_counts_as_much_as_it_is_known() -> None:

@@ -106,11 +106,11 @@ class Belief:
     def after(self, rows: IntArray, mean: FloatArray, covariance: FloatArray) -> Belief:
         """The belief once more is known of some of the parameters, (k,) and (k, k): of the others by what ties them."""
         gain = np.linalg.solve(self.covariance[np.ix_(rows, rows)], self.covariance[rows]).T
-        return replace(
-            self,
-            mean=self.mean + gain @ (mean - self.mean[rows]),
-            covariance=self.covariance + gain @ (covariance - self.covariance[np.ix_(rows, rows)]) @ gain.T,
-        )
+        moved = self.mean + gain @ (mean - self.mean[rows])
+        spread = self.covariance + gain @ (covariance - self.covariance[np.ix_(rows, rows)]) @ gain.T
+        # to the bit: rounding must not take a mean beyond its bound
+        moved[rows], spread[np.ix_(rows, rows)] = mean, covariance
+        return replace(self, mean=moved, covariance=0.5 * (spread + spread.T))
 
     def whitened(self, candidates: FloatArray) -> FloatArray:
         """(m, p) by how many standard deviations candidates (m, p) are off, in independent directions."""

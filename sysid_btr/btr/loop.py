@@ -248,7 +248,8 @@ class _Loop:
         if learnt is not None:
             self.simulations += round(learnt.simulations * self._looked_at)
         if learnt is not None and learnt.explained:
-            self.terms, self.belief, self.values = tuple(terms), learnt.belief, learnt.belief.mean
+            self.terms, self.belief = tuple(terms), learnt.belief
+            self.values = np.clip(learnt.belief.mean, terms.lower, terms.upper)
             self.stage = self._stage(self.terms)
             self.rivals = self.values[None]
         return learnt
