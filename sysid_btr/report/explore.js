@@ -36,6 +36,7 @@ function digitsOf(value, std) {
   const decimals = 1 - Math.floor(Math.log10(std));
   return decimals >= 0 && decimals <= 7 ? value.toFixed(decimals).replace("-", "−") : shown(value);
 }
+const brief = name => (name.length > 36 ? `${name.slice(0, 26)}… (${name.split(",").length})` : name);
 function make(tag, text, attributes = {}) {
   const element = Object.assign(document.createElement(tag), attributes);
   if (text !== null) element.textContent = text;
@@ -80,7 +81,8 @@ function table(id, title, note, columns, rows, pick = null) {
     const line = make("tr", null, { className: pick ? "pick" : "" });
     for (const k of visible) {
       const words = columns[k][2] ? columns[k][2](rows[i]) : shown(row[k]);
-      const cell = make("td", words, { className: numeric[k] ? "n" : words.length > 40 ? "wide" : words.length < 20 ? "u" : "" });
+      const cell = make("td", null, { className: numeric[k] ? "n" : words.length > 40 ? "wide" : words.length < 20 ? "u" : "" });
+      words.split(/(?<=,)(?=\S)/).forEach((piece, n) => cell.append(...(n ? [make("wbr", null)] : []), piece));
       if (k) cell.dataset.label = columns[k][0];
       line.append(cell);
     }
@@ -246,13 +248,13 @@ function matrix(id, rows, columns, values, more) {
 }
 function matrices() {
   const estimates = [...result.parameters, ...result.effects.flatMap(e => e.parameters)];
-  const names = estimates.map((p, k) => `${p.name} ${k + 1}`);
+  const names = estimates.map((p, k) => `${brief(p.name)} ${k + 1}`);
   matrix("correlation", names, names, result.correlation ?? [], {
     colour: v => v, words: v => shown(v, 3), bar: { tickvals: [-1, 0, 1] },
     map: { zmin: -1, zmax: 1, colorscale: [[0, "#388bfd"], [0.5, css("--panel")], [1, css("--m0")]] } });
   const moved = result.sensitivity ?? [];
   const places = [...new Set(moved.flatMap(p => Object.keys(p.moves)))];
-  const columns = moved.map((p, k) => `${p.name} by ${shown(p.change, 2)}${p.unit === "1" ? " × nominal" : " " + p.unit}`);
+  const columns = moved.map((p, k) => `${brief(p.name)} by ${shown(p.change, 2)}${p.unit === "1" ? " × nominal" : " " + p.unit}`);
   const values = places.map(place => moved.map(p => p.moves[place] ?? null));
   const most = Math.max(...values.flat().map(v => v ?? 0), 10), top = Math.ceil(Math.log10(most));
   const ticks = Array.from({ length: top + 2 }, (_, k) => k - 1);

@@ -27,6 +27,7 @@ from sysid_btr.units import si, si_all, with_digits_of
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 LARGEST, LARGEST_RAW = 4_000_000, 500_000
 """Characters of a page's pictures, and of result.json in it; the whole stays below 5 MB."""
@@ -138,6 +139,7 @@ def environment() -> Environment:
         certainty=certainty_words,
         typeset=_typeset,
         count=_count,
+        breakable=_breakable,
     )
     return made
 
@@ -150,6 +152,13 @@ def _count(value: float | None) -> str:
 def _typeset(text: str) -> str:
     """Signs that a terminal may not have."""
     return text.replace("+-", "±").replace("->", "→")
+
+
+def _breakable(name: str) -> Markup:
+    """A name that may go on in the next line after each of its places."""
+    from markupsafe import Markup, escape
+
+    return Markup(",<wbr>").join(map(escape, name.split(",")))
 
 
 def _data_uri(png: bytes) -> str:
