@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -203,6 +204,23 @@ def test_least_squares_resumes_from_every_record(tmp_path: Path) -> None:
         assert witness.asked() + again.asked() == reference.asked()
         assert resumed.jacobian is not None
         assert resumed.jacobian.tobytes() == whole.jacobian.tobytes()
+
+
+@pytest.mark.parametrize("change", [None, [0.0], [[1.0]]])
+def test_a_record_that_lacks_what_the_search_keeps_is_refused(tmp_path: Path, change: list[object] | None) -> None:
+    """With a checksum that is right: somebody wrote it."""
+    path, problem = tmp_path / "fit.journal", exponential_decay(np.random.default_rng(0), noise=0.01)
+    run(get_estimator("lsq"), problem, journal=Journal(path))
+    whole = Journal(path)
+    number = next(i for i, record in enumerate(whole.records) if record.kind == "residuals")
+    record = whole.records[number]
+    arrays = {name: values for name, values in record.arrays.items() if name != "gram"}
+    changed = replace(record, arrays=arrays if change is None else {**arrays, "gram": np.array(change)})
+    lines = path.read_bytes().splitlines(keepends=True)
+    lines[number + 1] = changed.to_line()
+    path.write_bytes(b"".join(lines))
+    with pytest.raises(UsageError, match=f"record {number + 1} of the journal.*--overwrite"):
+        run(get_estimator("lsq"), problem, journal=Journal(path))
 
 
 def test_resumed_twice_is_as_once(tmp_path: Path) -> None:

@@ -132,6 +132,11 @@ def test_names_are_taken_for_what_they_plainly_say(name: str, column: str | None
     assert guess([name]).columns.get(name) == column
 
 
+def test_a_name_of_brackets_alone_is_seen_through_at_once() -> None:
+    """An expression of nested repeats takes hours for it."""
+    assert guess(["a" + "[ " * 10_000 + "]", "[" * 10_000 + "deg]"]).columns == {}
+
+
 def test_units_in_names_are_read_but_not_put_into_the_joint() -> None:
     found = guess(["time_ms", "knee_pos_deg", "velocity (rpm)", "knee_vel [rpm]", "knee_current [mA]"])
     assert found.time == "time_ms"

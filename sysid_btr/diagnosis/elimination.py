@@ -28,6 +28,9 @@ from sysid_btr.identify.refit import inflate, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import Effect
 
+SETTLED = 0.01
+"""Change of the misfit, as a fraction, below which states and parameters are no longer updated in turn."""
+
 
 def eliminate(state: State, rules: Selection, progress: Progress) -> State:
     """The model with only those effects that data want, at the optimum and with intervals."""
@@ -40,8 +43,10 @@ def eliminate(state: State, rules: Selection, progress: Progress) -> State:
     for _ in range(state.study.procedure.last_turns):
         # they were those of a model that lacked its last effect
         study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)
-        again = refit(study, state.fitted.model)
+        again, before = refit(study, state.fitted.model), state.fitted.misfit
         state = replace(state, study=study, fitted=again).spent(again.evaluations)
+        if abs(again.misfit - before) < SETTLED * before:
+            break
     study = inflate(state.study, state.fitted, memory=True)
     progress(done=state.replays, total=None, best=nan, note="final fit")
     polished = refit(study, state.fitted.model, polish=True, progress=progress)

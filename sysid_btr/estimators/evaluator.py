@@ -119,12 +119,24 @@ class Evaluator:
             raise Stop(Termination.BUDGET_SPENT)
         return losses
 
-    def reduce(self, problem: ResidualProblem, candidates: FloatArray, reduction: Reduction, note: str = "") -> Reduced:
-        """Residuals of candidates ``(m, p)``, reduced to what the estimator needs of them.
+    def reduce(
+        self,
+        problem: ResidualProblem,
+        candidates: FloatArray,
+        reduction: Reduction,
+        note: str,
+        shapes: Mapping[str, tuple[int, ...]],
+    ) -> Reduced:
+        """Residuals of candidates ``(m, p)``, reduced to what the estimator needs of them: arrays of given `shapes`.
 
         Residuals are large; only what `reduction` returns is kept and journalled. It is called only for
         batches that are simulated now, not for replayed ones. A batch the budget cannot pay for in full is
         not begun.
+
+        Raises
+        ------
+        UsageError
+            The journal holds other arrays.
         """
         asked = self._admit(candidates)
         if self.remaining is not None and len(asked) > self.remaining:
@@ -140,6 +152,11 @@ class Evaluator:
             arrays, large = reduction(rows)
             record = Record("residuals", asked, {**arrays, "loss": loss}, self.seconds)
             self._journal.append(record, large)
+        elif any(name not in record.arrays or record.arrays[name].shape != shape for name, shape in shapes.items()):
+            raise UsageError(
+                f"record {self._journal.position} of the journal does not hold what this search keeps: the file was "
+                "changed. Start over (--overwrite)"
+            )
         number = self._journal.position - 1
         self._account(asked, record.arrays["loss"], note)
         return Reduced(record.arrays["loss"], record.arrays, lambda: self._journal.attachment(number))

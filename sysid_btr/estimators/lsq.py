@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.errors import SysidError, UsageError
+from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import (
     Budget,
     FitResult,
@@ -376,9 +376,10 @@ class LeastSquares:
             note = f"iteration {iteration}"
             model, steps = _linearise(problem, evaluator, u, steps, scheme, note)
             if abs(model.loss - loss) > _LOSS_MISMATCH * loss + np.finfo(float).tiny:
-                raise SysidError(
+                raise UsageError(
                     f"the objective is inconsistent: simulated twice at the same parameters, its loss was "
-                    f"{loss:.9g}, then the sum of its squared residuals {model.loss:.9g}"
+                    f"{loss:.9g}, then the sum of its squared residuals {model.loss:.9g}. A simulator has to give the "
+                    "same twice; if this one does, the journal was changed: start over (--overwrite)"
                 )
             full = model.step(0.0, -u, 1.0 - u, scheme.rank_tolerance)
             promised = model.predicted(full)
@@ -517,7 +518,9 @@ def _simulate_stencil(
         stack[:-1][failed] = np.nan
         return arrays, stack
 
-    reduced = evaluator.reduce(problem, candidates, reduction, note)
+    p = len(candidates[0])
+    shapes = {"gram": (p + 1, p + 1), "failed": (p,), "size": (1,)}
+    reduced = evaluator.reduce(problem, candidates, reduction, note, shapes)
     gram, failed = reduced.arrays["gram"], reduced.arrays["failed"] > 0.0
     change = np.sqrt(np.diag(gram)[:-1]) * np.abs(stencil.offsets).max(axis=1)
     loss = float(reduced.loss[0])

@@ -510,13 +510,12 @@ def measurements(chain: Chain) -> tuple[FloatArray, FloatArray]:
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Lower band (2 d, n d) of a symmetric matrix of blocks: (n, d, d), and (n - 1, d, d) below them."""
     n, d, _ = diagonal.shape
-    band = np.zeros((2 * d, n * d))
-    at = np.arange(n)[:, None] * d
-    r, c = np.tril_indices(d)
-    band[r - c, at + c] = diagonal[:, r, c]
-    r, c = (g.ravel() for g in np.indices((d, d)))
-    band[d + r - c, at[:-1] + c] = below[:, r, c]
-    return band
+    band = np.zeros((2 * d, n, d))
+    for k in range(d):
+        band[k, :, : d - k] = np.diagonal(diagonal, -k, 1, 2)
+        band[d + k, :-1, : d - k] = np.diagonal(below, -k, 1, 2)
+        band[d - k, :-1, k:] = np.diagonal(below, k, 1, 2)
+    return band.reshape(2 * d, n * d)
 
 
 def moved_chain(chain: Chain, known: Derivatives, found: Round, change: FloatArray) -> Chain:

@@ -97,7 +97,7 @@ def distance(pair: Tracking) -> float:
 def trackings(log: Log, joints: Sequence[str]) -> Mapping[str, Tracking]:
     """Those joints that have both command and position, on a regular clock of at most 100 Hz."""
     interval = typical_interval(log.time[np.isfinite(log.time)])
-    if not np.isfinite(interval) or len(log) < _MIN_SAMPLES:
+    if not np.isfinite(interval * len(log)) or len(log) < _MIN_SAMPLES:
         return {}
     time = _continuous_time(log, interval)
     step = max(interval, _STEP)

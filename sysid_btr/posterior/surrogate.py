@@ -129,7 +129,8 @@ def regress(
         inner = np.einsum("ar,br->ab", rows[good], rows[good])
         return {"gram": inverse @ inner @ inverse.T}, None
 
-    reduced = evaluator.reduce(problem, evaluator.box.leave(design), reduction, "learning the residuals")
+    points, shape = evaluator.box.leave(design), (terms.shape[1],) * 2
+    reduced = evaluator.reduce(problem, points, reduction, "learning the residuals", {"gram": shape})
     return Foretold(frame, pairs, np.asarray(reduced.arrays["gram"]))
 
 

@@ -13,6 +13,8 @@ MUJOCO = "mujoco"
 
 USUAL = (("simulator", MUJOCO), ("stated", False))
 """What files do not say."""
+MOST_STEPS = 1e6
+"""Steps in a servo's period, beyond any that can be meant."""
 LONGEST = 0.1
 """s, of a step."""
 
@@ -47,6 +49,8 @@ class Numerics:
         for seconds in (self.timestep, self.servo_period):
             if seconds is not None and not 0 < seconds < math.inf:
                 raise ValueError(f"a step of {seconds} s")
+        if self.servo_period is not None and not self.servo_period < MOST_STEPS * self.timestep:
+            raise ValueError(f"a servo period of {self.servo_period} s in steps of {self.timestep} s")
 
     @classmethod
     def parse(cls, text: str) -> Numerics:

@@ -96,14 +96,17 @@ def guess(names: Sequence[str]) -> Guess:
 
 def _without_unit(name: str) -> tuple[str, str | None]:
     """A name and the unit that it ends with: ``pos [deg]``, ``pos_deg``, ``time_ms``, ``temperature (C)``."""
-    bracket = re.fullmatch(r"(.+?)\s*[\[(]\s*([^\])]+?)\s*[\])]", name.strip())
-    if bracket and find(bracket[2]):
-        return bracket[1], bracket[2]
-    tail = re.fullmatch(r"(.+?)[_ .]([A-Za-z]{2,4})", name.strip())
+    name = name.strip()
+    if name.endswith(("]", ")")):
+        at = max(name.rfind("["), name.rfind("("), 0)
+        bare, unit = name[:at].strip(), name[at + 1 : -1].strip()
+        if bare and find(unit):
+            return bare, unit
+    tail = re.fullmatch(r"(.+?)[_ .]([A-Za-z]{2,4})", name)
     if tail and find(tail[2]) and tail[2].casefold() not in _WORDS:
         return tail[1], tail[2]
-    short = re.fullmatch(r"(t|time|timestamp|stamp)[_ ]?(s|ms|us|ns)", name.strip(), re.I)
-    return (short[1], short[2]) if short else (name.strip(), None)
+    short = re.fullmatch(r"(t|time|timestamp|stamp)[_ ]?(s|ms|us|ns)", name, re.I)
+    return (short[1], short[2]) if short else (name, None)
 
 
 def _imu(name: str) -> str | None:

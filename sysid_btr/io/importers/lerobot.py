@@ -243,14 +243,17 @@ def _array(column: Any) -> np.ndarray[Any, Any] | None:
 def _time(columns: Mapping[str, np.ndarray[Any, Any]], fps: float) -> tuple[FloatArray, list[str]]:
     """Time from the begin of each episode: frame / fps, unless the stamps say that the clock was another."""
     nominal: FloatArray | None = None
+    for name in ("frame_index", "timestamp"):
+        if name in columns and columns[name].size != len(columns[name]):
+            raise LogError(f"{name}: several numbers in a frame, where one is expected; record or download again")
     if "frame_index" in columns:
-        nominal = columns["frame_index"] / fps
+        nominal = columns["frame_index"].ravel() / fps
     stamps = columns.get("timestamp")
     if stamps is None:
         if nominal is None:
             raise LogError("the dataset has neither timestamp nor frame_index")
         return nominal, []
-    stamps = stamps.reshape(len(stamps))
+    stamps = stamps.ravel()
     if nominal is not None and np.allclose(nominal, stamps, rtol=0, atol=_TOLERANCE):
         said = "times are frame / fps, as in the dataset: when a sample was really taken is not recorded"
         return nominal, [said]

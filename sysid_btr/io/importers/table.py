@@ -38,7 +38,7 @@ PIECE, TEXT = 1 << 24, 4.0
 """Bytes that are unpacked at a time, and how often a text lies in memory while its table is read."""
 SLOW = 0.2
 """s; a joint log that slow deserves a remark."""
-_NUMBER = re.compile(r"\s*[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?\s*")
+_NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
 _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d+,\d+([eE][-+]?\d+)?\s*")
 _DAYS = re.compile(r"\s*\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}")
 
@@ -109,7 +109,7 @@ def header_names(path: Path, head: bytes) -> list[str]:
 
         try:
             return list(pq.read_schema(path).names)
-        except (OSError, pa.ArrowException):
+        except (OSError, ValueError, pa.ArrowException):
             return []
     try:
         lines = _decode(head, strict=False).splitlines()
