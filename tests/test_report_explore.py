@@ -75,6 +75,7 @@ def test_every_joint_is_there_as_logged_and_as_scored(folder: Path) -> None:
     (episode,) = content["episodes"]
     assert content["models"] == ["plain model", "fitted"]
     assert content["stride"] == 1
+    assert f'"{content["schema"]}"' in (folder / "explore.html").read_text(), "the page knows what it reads"
     joints = [sensor["joint"] for sensor in episode["sensors"] if sensor["channel"] == "position"]
     assert set(joints) == set(log.joints("position"))
     plain = [s["errors"][0] / s["noise"] for s in episode["sensors"] if s["channel"] == "position"]

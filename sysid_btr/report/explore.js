@@ -3,6 +3,7 @@ const $ = id => document.getElementById(id);
 const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const KINDS = { f4: Float32Array, i2: Int16Array, u2: Uint16Array };
 const array = packed => new KINDS[packed.type](bytes(packed.data).buffer);
+const SCHEMA = "sysid_btr.explore/1";
 const MOST_POINTS = 4000, STRETCHES = 300, NARROW = 600;
 const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const touch = matchMedia("(pointer: coarse)").matches;  // there a finger on a picture scrolls the page
@@ -180,10 +181,10 @@ function signals() {
 
 function readout() {
   const s = sensor(), i = sample(episode().time, state.time);
-  const cells = [["at the cursor", "value", "off the log"]];
+  const cells = [["at the cursor", "value", "log − model"]];
   if (isFinite(s.command[i])) cells.push(["command", si(s.command[i], s.unit.replace(/N$|Nm$|\/s$/, "")), ""]);
   cells.push(["log", si(s.log[i], s.unit), ""]);
-  data.models.forEach((name, k) => cells.push([name, si(s.predicted[k][i], s.unit), si(-s.residual[k][i], s.unit, 3)]));
+  data.models.forEach((name, k) => cells.push([name, si(s.predicted[k][i], s.unit), si(s.residual[k][i], s.unit, 3)]));
   const colours = { command: css("--faint"), log: css("--ink") };
   data.models.forEach((name, k) => (colours[name] = data.colours[k]));
   $("readout").replaceChildren(...cells.flatMap((row, n) => row.map((text, k) => {
@@ -428,6 +429,7 @@ function draw() {
 async function main() {
   result = JSON.parse($("result").textContent);
   data = JSON.parse(await unpacked("series"));
+  if (data.schema !== SCHEMA) throw new Error(`its explore.json.gz has schema ${data.schema}, and this page shows ${SCHEMA}`);
   document.head.append(make("script", await unpacked("plotly")));
   prepare();
   document.querySelector("main").hidden = false;

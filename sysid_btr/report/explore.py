@@ -29,6 +29,8 @@ from sysid_btr.run_folder import DRAWS, MODEL, PARAMS, REPORT, RESULT
 if TYPE_CHECKING:
     import mujoco
 
+SCHEMA = "sysid_btr.explore/1"
+"""Of what explore.js reads."""
 MOST_NUMBERS = 600_000
 """Numbers of all series together; of longer logs every other sample is left out, or more."""
 FRAMES, RATE = 600, 25.0
@@ -47,6 +49,7 @@ def explorable(played: Played) -> bytes:
     stride = max(int(np.ceil(sensors * (2 + len(played.models)) / MOST_NUMBERS)), 1)
     bodies = bodies_of(played.episodes[0].replay.model) if played.episodes else ()
     content = {
+        "schema": SCHEMA,
         "models": played.models,
         "colours": model_colours(len(played.models)),
         "rank_by": played.models.index(played.rank_by),
