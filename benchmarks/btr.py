@@ -12,7 +12,8 @@ three of these at once, another amount in every seed. Each method has the same n
 - `randomised`: one search over the models believed in before any trial, its best gaits tried in order;
 - `cmaes`: CMA-ES on the robot alone.
 
-A run that is finished is read, one that was stopped goes on; the table is of all that are finished.
+A run that is finished is read, one that was stopped goes on; the table is of all that are finished, and of
+those that it held.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -256,7 +258,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             for method in options.methods:
                 run(name, method, seed, plan, options.out)
     found = [json.loads(p.read_text()) for p in sorted(options.out.glob("*/*/summary.json"))]
-    summary = table(found)
+    rows = {(r["robot"], r["seed"], r["method"]): r for r in json.loads(RESULTS.read_text())["runs"]}
+    summary = table([*({**rows, **{(r["robot"], r["seed"], r["method"]): r for r in map(_row, found)}}.values())])
     if found and options.record:
         RESULTS.write_text(to_json(summary))
     print(show(summary))
@@ -280,12 +283,27 @@ def run(name: str, method: str, seed: int, plan: Plan, out: Path) -> None:
         cpu += process_time()
         spent.write_text(json.dumps(cpu))
     found = {"robot": name, "method": method, "seed": seed, "plan": vars(plan), "truth": asdict(robot.truth)}
-    done.write_text(to_json({**found, "trials": trials, "cpu_s": cpu}))
+    result = folder / "result.json"
+    known = json.loads(result.read_text())["parameters"] if result.exists() and method == "learning" else []
+    learnt = {p["name"]: [p["value"], *p["ci95"], truth_of(p["name"], robot.truth)] for p in known}
+    done.write_text(to_json({**found, "trials": trials, "cpu_s": cpu, "learnt": learnt}))
 
 
-def table(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def truth_of(name: str, truth: Truth) -> float:
+    """What a declared parameter is on the robot: the mean over its places, payloads included."""
+    term, _, where = name.partition(":")
+    if term == "command_delay":
+        return truth.delay
+    if term in ("kp", "kv"):
+        own = getattr(truth, term)
+        return float(np.mean([own.get(j, 1.0) for j in SPACE.joints])) * (truth.gain if term == "kp" else 1.0)
+    bodies = [b for b in BODIES if fnmatchcase(b, where)]
+    nominal = {b: float(NAO.model.body(b).mass[0]) for b in bodies}
+    return float(np.mean([truth.mass.get(b, 1.0) + truth.payload.get(b, (0.0, ()))[0] / nominal[b] for b in bodies]))
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Each run, and each method over all robots that it was run on."""
-    rows = [_row(f) for f in found]
     methods = [m for m in METHODS if any(r["method"] == m for r in rows)]
     return {
         "command": " ".join(
@@ -335,6 +353,7 @@ def _row(f: Mapping[str, Any]) -> dict[str, Any]:
         "told": len(told),
         "falls_foreseen": float(sum(1 - s["stands"] for _, s in told)),
         "cpu_s": f["cpu_s"],
+        "learnt": f.get("learnt", {}),
     }
 
 
@@ -373,6 +392,10 @@ def show(summary: Mapping[str, Any]) -> str:
         best = ", ".join(f"{b:.3f} after {n}" for n, b in m["best_median"].items())
         fell = "" if falls is None else f", {falls:.0%} after the first iteration"
         lines.append(f"{name}: {m['runs']} runs, {m['fell']:.0%} of trials fell{fell}; median best {best}{held}")
+    for r in summary["runs"]:
+        known = [low <= truth <= high for _, low, high, truth in r.get("learnt", {}).values()]
+        if known:
+            lines.append(f"{r['robot']} {r['seed']}: {sum(known)} of {len(known)} 95 % intervals hold the truth")
     for name, ahead in summary["ahead_after_10_of_others_at_the_end"].items():
         lines.append(
             f"{name} after 10 trials ahead of all trials of: " + ", ".join(f"{m} {k}" for m, k in ahead.items())

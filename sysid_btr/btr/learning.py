@@ -25,7 +25,6 @@ from sysid_btr.identify.refit import Fitted, inflate, judge
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot
-from sysid_btr.objectives.covariance import covariance
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import Folder
@@ -130,6 +129,8 @@ def learn(
     rows = np.concatenate([np.arange(len(belief.mean))[terms.columns(term)] for term in shown])
     own = belief.of(rows)
     model, spent = Model.of(shown, own.mean), 0
+    if not np.array_equal(model.values, model.terms.nominal):
+        study = study.with_initial_states(model)  # those of a study are the plain model's
     first = _judged(study, model)
     study = inflate(study, first, memory=True)
     reached: list[tuple[Study, Fitted]] = []
@@ -147,9 +148,9 @@ def learn(
     model, explained = found.model, found.train <= study.procedure.tolerated
     if explained:
         problem = MapProblem(study.train_problem(model), own)
-        residual, jacobian = linearise(problem, model.values)
-        labels = np.concatenate([problem.problem.blocks, problem.problem.blocks.max() + 1 + np.arange(len(rows))])
-        belief = belief.after(rows, model.values, covariance(jacobian, residual, labels))
+        jacobian = linearise(problem, model.values)[1]
+        # the logs' noise is inflated by what is left of them, and by how long that remembers
+        belief = belief.after(rows, model.values, np.asarray(np.linalg.inv(jacobian.T @ jacobian)))
     return Learnt(belief, first.train, found.train, explained, spent)
 
 
