@@ -51,8 +51,6 @@ UNCORRELATED = 0.2
 """Rank correlation of expected and real fitness up to which the model does not predict which controller is better."""
 HELD = 0.5
 """Share of trials within their 90 % interval from which what was foreseen is not lost, whatever the order."""
-STUCK = 0.9
-"""What is missing is looked for if Step 3 leaves more than this fraction of the loss, or it was not looked for yet."""
 
 STEPS = {"models_drawn": 0, "controllers": 1, "outlook": 2, "models": 3}
 """Searches of an iteration by the paper's numbers."""
@@ -204,7 +202,7 @@ class _Loop:
             return replace(report, population_names=problem.names, promise=promise, untied=untied)
         problem = self._model_problem(self._remembered(), before)
         searched = self._search_model(number, problem) if self.settings.learn else None
-        if searched is not None and self.settings.close and self._stuck(problem, searched[1]):
+        if searched is not None and problem.targets and self._lacking(problem.noise(self.values)):
             joined = self._close(number, before)
             if joined:
                 problem = self._model_problem(self._remembered(), self.values)
@@ -216,7 +214,7 @@ class _Loop:
     def _learn(self, number: int) -> tuple[Learnt | None, str]:
         """Step 3 by a likelihood, and what `close` says, once, where too little is explained."""
         learnt = self._learnt(number, "learnt")
-        if not self.settings.close or learnt is None or learnt.explained or any(r.joined for r in self.rounds):
+        if learnt is None or learnt.explained or not self._lacking(np.inf):
             return learnt, ""
         before = self.terms, self.stage, self.values, self.belief
         joined = self._close(number, self.values)
@@ -399,14 +397,9 @@ class _Loop:
         path = None if self.folder is None else self.folder / "journals" / f"{label}.jsonl"
         return Journal(path, fingerprint=f"{self._print}/{label}")
 
-    def _stuck(self, problem: ModelProblem, journal: Journal) -> bool:
-        """Whether the sensors say that something is missing, and Step 3 found hardly anything better.
-
-        The first time it need not have tried for long: missing effects spoil the parameters that it fits.
-        """
-        losses = _all_of(journal)[1]
-        little = float(np.min(losses)) > STUCK * float(losses[0]) or not any(r.joined for r in self.rounds)
-        return little and bool(problem.targets) and problem.noise(self.values) > EXPLAINED
+    def _lacking(self, noise: float) -> bool:
+        """Whether what is missing is looked for: once, where so many noise floors are left. It takes minutes."""
+        return self.settings.close and not any(r.joined for r in self.rounds) and noise > EXPLAINED
 
     def _close(self, number: int, values: FloatArray) -> str:
         """Name missing effects and add them to the model; what was found, in words.
