@@ -397,7 +397,7 @@ class InnovationsEpisode(Episode):
         n = len(self.log)
         chain, known = found.chain.part(0, n), found.known.part(0, n)
         chain = replace(chain, steps=replace(chain.steps, terms=replay.terms, numerics=coarse, threads=replay.threads))
-        chain, own = follow_states(chain, known, values, ROUNDS, fitted=True)
+        chain, own = follow_states(chain, known, values, ROUNDS)
         return replace(found, chain=chain, known=known, filter=own)
 
     def _begun(self, numerics: Numerics, threads: int) -> Self:
@@ -416,7 +416,7 @@ class InnovationsEpisode(Episode):
                     f"states as measured, with steps of {1e3 * numerics.timestep:.3g} ms. Check armature and masses: a "
                     "body without mass is the usual cause."
                 )
-            chain, own = follow_states(chain, known, terms.nominal, FIRST_ROUNDS, fitted=False)
+            chain, own = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
             return chain, known, own
 
         key = ("innovations", self.robot.fingerprint, self.robot.at, numerics)
@@ -449,17 +449,13 @@ def _of_innovations(target: Target, own: Filter) -> Target:
     return replace(target, floor=tuple(floor))
 
 
-def follow_states(
-    chain: Chain, known: Derivatives, values: FloatArray, rounds: int, *, fitted: bool
-) -> tuple[Chain, Filter]:
-    """A chain about its most probable states under a candidate, and the filter there.
-
-    How large jolts are is told once states have moved, at the numbers that suit them best: these, if they are `fitted`.
-    """
+def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: int) -> tuple[Chain, Filter]:
+    """A chain about its most probable states under a candidate, and the filter there."""
     terms = Terms(chain.steps.terms)
     numbers, step = np.arange(len(values)), NUDGE_NUMBER * (terms.upper - terms.lower)
     for k in range(rounds):
-        sized = slice(None if k == rounds - 2 and not fitted else 0)
+        # how large jolts are is told once states have moved, at the numbers that suit them best
+        sized = slice(None if k == rounds - 2 else 0)
         ends = simulate_chain(chain, values, numbers[sized], step[sized])
         if k == rounds - 2:
             chain = likeliest(chain, known, ends, SLACKS)

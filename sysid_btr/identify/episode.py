@@ -70,7 +70,7 @@ class Procedure:
     alternations : iterations of the first fits by the coarse integrator, after each of which the initial states are
         updated.
     shares : lengths of segment in these, as fractions of the whole one.
-    last_turns : times that initial states and parameters are updated in turn once all effects are known.
+    last_turns : times at most that initial states and parameters are updated in turn once all effects are known.
     coarse_suffices : whether a fit by the coarse integrator need not be repeated by the reference one before its
         errors are judged.
     deferred : whether derivatives are always taken by a cheaper integrator.
