@@ -19,6 +19,7 @@ from sysid_btr.btr.robot import HiddenRobot, Noise, Trial
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.trials import Tried
 from sysid_btr.btr.world import make_world
+from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import silent
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import servo_joints
@@ -144,6 +145,9 @@ def test_what_was_learnt_is_not_learnt_again(tmp_path: Path, monkeypatch: pytest
     np.testing.assert_array_equal(again.belief.mean, TRUTH)
     np.testing.assert_array_equal(again.belief.covariance, 0.1 * belief.covariance)
     assert (str(again), again.simulations) == (str(first), 7)
+    path.write_text('{"before": 4.0, "mean": [1.0]}')
+    with pytest.raises(UsageError, match=r"01\.json was changed"):
+        learnt_once(path, *given)
 
 
 def test_without_a_log_nothing_is_learnt() -> None:

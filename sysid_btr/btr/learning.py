@@ -200,8 +200,17 @@ def learnt_once(
 
 
 def _read(path: Path, belief: Belief) -> Learnt:
-    content = parse_json(path.read_text(encoding="utf-8"))
-    numbers = {name: content[name] for name in ("before", "after", "explained", "simulations")}
-    return Learnt(
-        replace(belief, mean=np.array(content["mean"]), covariance=np.array(content["covariance"])), **numbers
-    )
+    """What was kept of an earlier run.
+
+    Raises
+    ------
+    UsageError
+        If it is not what was written.
+    """
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"))
+        numbers = {name: content[name] for name in ("before", "after", "explained", "simulations")}
+        mean, covariance = (np.array(content[name], dtype=np.float64) for name in ("mean", "covariance"))
+        return Learnt(replace(belief, mean=mean, covariance=covariance), **numbers)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise UsageError(f"{path} was changed and cannot be read ({error!r}): start over (--overwrite)") from error
