@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -124,8 +125,8 @@ class Evaluator:
         problem: ResidualProblem,
         candidates: FloatArray,
         reduction: Reduction,
-        note: str,
-        shapes: Mapping[str, tuple[int, ...]],
+        note: str = "",
+        shapes: Mapping[str, tuple[int, ...]] = MappingProxyType({}),
     ) -> Reduced:
         """Residuals of candidates ``(m, p)``, reduced to what the estimator needs of them: arrays of given `shapes`.
 
