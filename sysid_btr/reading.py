@@ -13,12 +13,22 @@ def parse_json(text: str | bytes, **options: Any) -> Any:
     Raises
     ------
     ValueError
-        If it is not JSON, or nested so deeply that nobody meant it.
+        If it is not JSON, or nested so deeply that nobody meant it, or a whole number in it is beyond any that can be
+        computed with.
     """
     try:
-        return json.loads(text, **options)
+        return json.loads(text, **{"parse_int": _whole, **options})
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def _whole(digits: str) -> int:
+    value = int(digits)
+    try:
+        float(value)
+    except OverflowError:
+        raise ValueError(f"it holds a whole number of {len(digits)} digits") from None
+    return value
 
 
 def parse_toml(content: bytes) -> dict[str, Any]:

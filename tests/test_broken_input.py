@@ -100,6 +100,12 @@ def test_a_report_of_a_result_that_was_edited(tmp_path: Path, cli: Cli, fitted: 
     assert cli("report", tmp_path).code in (0, 2)
 
 
+def test_a_whole_number_beyond_those_that_can_be_computed_with_is_no_json() -> None:
+    assert parse_json(f"[{10**300}]") == [10**300]
+    with pytest.raises(ValueError, match="400 digits"):
+        parse_json("9" * 400)
+
+
 def test_a_record_of_a_journal_without_a_loss_is_a_damaged_one() -> None:
     whole = Record("loss", np.zeros((2, 1)), {"loss": np.ones(2)}, 1.0)
     assert Record.from_line(whole.to_line().strip()).kind == "loss"

@@ -212,5 +212,5 @@ def _read(path: Path, belief: Belief) -> Learnt:
         numbers = {name: content[name] for name in ("before", "after", "explained", "simulations")}
         mean, covariance = (np.array(content[name], dtype=np.float64) for name in ("mean", "covariance"))
         return Learnt(replace(belief, mean=mean, covariance=covariance), **numbers)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise UsageError(f"{path} was changed and cannot be read ({error!r}): start over (--overwrite)") from error

@@ -72,7 +72,7 @@ def read_params(path: Path, robot: Robot) -> Params:
         numerics = Numerics(
             str(own["integrator"]), float(own["timestep"]), period, str(own["simulator"]), bool(own["stated"])
         )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise UsageError(
             f"--params {file} was changed and cannot be read: {error!r}; give one as it was written"
         ) from error
