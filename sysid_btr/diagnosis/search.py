@@ -166,7 +166,7 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
         study = _weighed(study.with_share(study.procedure.shares[0], model), model)
     problem = shorten(study, rules.scan_seconds).train_problem(model)
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
-    asked = _perturbations(state, library, problem, residual, rules)
+    asked = _perturbations(state, library, problem, residual)
     if study.procedure.costly and len(asked) > rules.glance_most:
         glance = shorten(study, rules.glance_seconds).train_problem(model)
         linear = linearise(glance, model.values, step=study.stencil(model.terms))
@@ -175,12 +175,6 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     # what is left is the right integrator's; what an effect would change may be a little off
     cheap = problem.with_numerics(study.cheap)
     found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
-    if rules.alike:
-        # one hypothesis an effect, begun at its best working point: initial guesses hold other amounts
-        best: dict[type[Effect], Sensitivity] = {}
-        for one in found:
-            best.setdefault(one.perturbation.effect, one)
-        found = list(best.values())
     return found, len(residual)
 
 
@@ -192,17 +186,12 @@ def _weighed(study: Study, model: Model) -> Study:
     return inflate(study, replace(judge(study, model), train_columns=problem.column_chi2(left)))
 
 
-def _perturbations(
-    state: State, library: Library, problem: ReplayProblem, residual: FloatArray, rules: Selection
-) -> list[Perturbation]:
+def _perturbations(state: State, library: Library, problem: ReplayProblem, residual: FloatArray) -> list[Perturbation]:
     """What a scan asks for: a term already at a location is not, as it is refitted with everything else."""
     study = state.study
     places: dict[str, tuple[str, ...]] = {scope: study.robot.names(scope) for scope in get_args(Scope)}
     asked: list[Perturbation] = perturbations(library, places, study.scales)
-    if rules.alike:
-        asked = [q for q in asked if len(q.places) > 1 or q.effect.scope == "robot"]
-    else:
-        asked += proposals(study, problem, problem.start, residual, library)
+    asked += proposals(study, problem, problem.start, residual, library)
     terms = state.fitted.model.terms
     present = {(type(t), p) for t in terms if t.numbers == t.kinds for p in t.places}
     split = {p for t in terms if t.structural for p in t.places}

@@ -29,10 +29,6 @@ class Selection:
 
     # --- how much is looked at ---
 
-    alike: bool = False
-    """Ask only for effects of the whole robot, and for those that are the same at all their locations: few short logs
-    say no more, and it takes a small part of the simulations. Set by Back to Reality, which looks at few short
-    trials."""
     scan_seconds: float = 15.0
     """Part of each log that is scanned; the leading hypotheses are refitted on more. Time."""
     glance_seconds: float = 2.5

@@ -227,13 +227,8 @@ class Journal:
             values: FloatArray = np.load(self._attachment_path(self.path, number), allow_pickle=False)
             if crc32(values.tobytes()) != self._tape.records[number].attached:
                 raise ValueError("it is not what was written")
-        except (
-            OSError,
-            EOFError,
-            ValueError,
-            SyntaxError,
-            TokenError,
-        ) as error:  # numpy parses the head of a file as Python
+        # numpy parses the head of a file as Python
+        except (OSError, EOFError, ValueError, SyntaxError, TokenError) as error:
             raise UsageError(
                 f"{self._label}: the array that belongs to record {number + 1} cannot be read ({error}). "
                 "Start over with another journal (--overwrite)"

@@ -113,6 +113,10 @@ class FloatingEpisode(Episode):
     def procedure(self) -> Procedure:
         return FloatingProcedure(self.base.size.time(FASTEST))
 
+    @property
+    def base_poses(self) -> FloatArray:
+        return self.base.poses[: len(self.log)]
+
     @classmethod
     def whole(cls, robot: Robot, log: Log, threads: int = 0) -> FloatingEpisode:
         """All of a recording, up to a fall.

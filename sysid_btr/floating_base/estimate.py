@@ -109,6 +109,11 @@ class BaseState:
 
         return to_quaternion(Rotation.from_matrix(self.rotation))
 
+    @property
+    def poses(self) -> FloatArray:
+        """(n, 7) position and quaternion."""
+        return np.column_stack([self.position, self.quaternion])
+
     def rows(self, start: int, stop: int) -> BaseState:
         """Samples `start` to `stop` (exclusive)."""
         n = len(self.time)

@@ -297,6 +297,10 @@ class InnovationsEpisode(Episode):
     def procedure(self) -> Procedure:
         return InnovationsProcedure()
 
+    @property
+    def base_poses(self) -> FloatArray:
+        return self.base.poses[: len(self.log)]
+
     @staticmethod
     def suits(robot: Robot, log: Log) -> bool:
         """Whether a log can be compared so: samples are regular, and nothing in the model has a memory."""

@@ -191,6 +191,11 @@ class Episode(ABC):
         """(n,) samples of `log` that count and are replayed."""
         return self.scored[: len(self.log)]
 
+    @property
+    def base_poses(self) -> FloatArray | None:
+        """Position and quaternion (n, 7) of a free base at the samples of `log`; None of a fixed one."""
+        return None
+
     def logged(self, channels: Sequence[str]) -> tuple[str, ...]:
         """Those of the channels that the log has of any joint of the model."""
         joints = joint_names(self.robot.for_log(self.log))

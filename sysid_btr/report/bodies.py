@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -120,17 +120,13 @@ def _points(model: mujoco.MjModel, geom: int, most: int) -> FloatArray | None:
             rim = np.column_stack([np.cos(angle), np.sin(angle), np.ones(ring)])
             return np.asarray(np.concatenate([rim, rim * (1, 1, -1)]) * (size[0], size[0], size[1]))
         case kind.mjGEOM_BOX:
-            return np.asarray(size * np.array(list(_corners())))
+            return np.asarray(size * np.array(list(product((-1, 1), repeat=3))))
         case kind.mjGEOM_MESH:
             mesh = int(model.geom_dataid[geom])
             first = int(model.mesh_vertadr[mesh])
             vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])].astype(np.float64)
             return np.asarray(vertices[np.unique(np.argmax(vertices @ _ball(min(DETAIL, most)).T, axis=0))])
     return None
-
-
-def _corners() -> Iterator[tuple[int, int, int]]:
-    yield from ((x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1))
 
 
 @cache

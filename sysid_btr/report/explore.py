@@ -13,11 +13,12 @@ from collections.abc import Collection, Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.report.bodies import Body, bodies_of, filled, placed
 from sysid_btr.report.guide import about_verdict
 from sysid_btr.report.html import VERDICTS, environment
@@ -25,9 +26,6 @@ from sysid_btr.report.style import model_colours
 from sysid_btr.report.traces import Played, PlayedEpisode, Trace
 from sysid_btr.result import clean
 from sysid_btr.run_folder import DRAWS, MODEL, PARAMS, REPORT, RESULT
-
-if TYPE_CHECKING:
-    import mujoco
 
 SCHEMA = "sysid_btr.explore/1"
 """Of what explore.js reads."""
@@ -119,32 +117,13 @@ def _poses(item: PlayedEpisode) -> Iterator[FloatArray]:
         np.column_stack([filled(column, np.zeros(len(column))) for column in outputs[k].position[0].T]) for k in (0, -1)
     )
     logged = [filled(log.channels.get(f"position.{joint}"), last[:, k]) for k, joint in enumerate(index.joints)]
-    base, free = _logged_base(item), _free_joint(item.replay.model)
+    base, free = item.episode.base_poses, item.replay.model.jnt_qposadr[free_joints(item.replay.model)]
     for joints in (np.column_stack(logged), first, last):
         pose = np.tile(item.replay.model.qpos0, (len(joints), 1))
         pose[:, index.qpos] = joints
-        if base is not None and free is not None:
-            pose[:, free : free + 7] = base
+        if base is not None and len(free):
+            pose[:, free[0] : free[0] + 7] = base
         yield pose
-
-
-def _logged_base(item: PlayedEpisode) -> FloatArray | None:
-    """Position and quaternion (n, 7) of a free base as they were reconstructed; None of one that is fixed."""
-    from sysid_btr.floating_base.episode import FloatingEpisode
-    from sysid_btr.floating_base.innovations import InnovationsEpisode
-
-    if not isinstance(item.episode, FloatingEpisode | InnovationsEpisode):
-        return None
-    base = item.episode.base
-    return np.column_stack([base.position, base.quaternion])[: len(item.episode.log)]
-
-
-def _free_joint(model: mujoco.MjModel) -> int | None:
-    """Where the coordinates of a free base begin."""
-    import mujoco
-
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    return int(model.jnt_qposadr[free[0]]) if len(free) else None
 
 
 def packed(values: FloatArray | np.ndarray[Any, Any], kind: str) -> dict[str, Any]:
