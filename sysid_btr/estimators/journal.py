@@ -76,11 +76,19 @@ class Record:
             raise ValueError("every candidate has a loss")
         return cls(
             kind=str(content["kind"]),
-            candidates=np.array(content["candidates"], dtype=np.float64),
-            arrays={name: np.array(v, dtype=np.float64) for name, v in content["arrays"].items()},
+            candidates=_numbers(content["candidates"]),
+            arrays={name: _numbers(v) for name, v in content["arrays"].items()},
             seconds=float(content["seconds"]),
             attached=content["attached"],
         )
+
+
+def _numbers(values: object) -> FloatArray:
+    """An array of numbers alone: numpy would take null for one."""
+    found = np.array(values)
+    if found.dtype.kind not in "fi":
+        raise ValueError("what should be numbers is not")
+    return found.astype(np.float64)
 
 
 @dataclass

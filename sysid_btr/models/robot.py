@@ -148,7 +148,9 @@ def robot_from_file(path: Path) -> Robot:
             f"model {path}: MuJoCo does not read {path.suffix}: rename the file to end in {path.suffix.lower()}"
         )
     try:
-        make_spec().compile()
+        make_spec().compile().names.decode()
+    except UnicodeDecodeError as error:
+        raise ModelError(f"model {path}: a name in it is not UTF-8 text ({error}). Save the file as UTF-8") from error
     except (ValueError, OSError) as error:
         raise ModelError(
             f"model {path}: MuJoCo cannot read it: {error}. Give an MJCF or URDF file that MuJoCo's own viewer opens "
