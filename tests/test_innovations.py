@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
+import mujoco
 import numpy as np
 import pytest
 from test_contact_free import random_states
@@ -18,7 +19,7 @@ from benchmarks import ground
 from sysid_btr.errors import UsageError
 from sysid_btr.floating_base import chain as chain_module
 from sysid_btr.floating_base import innovations
-from sysid_btr.floating_base.chain import Chain, Derivatives
+from sysid_btr.floating_base.chain import Chain, Derivatives, derive, stale
 from sysid_btr.floating_base.episode import FloatingEpisode
 from sysid_btr.floating_base.innovations import Innovations, InnovationsEpisode, kalman_filter
 from sysid_btr.floating_base.size import NAO
@@ -29,6 +30,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.model import Model, Terms
 
 
 def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,6 +114,49 @@ def test_masses_and_gains_lie_within_their_intervals_and_only_noise_is_left() ->
     assert 0.5 < np.median(chi2) < 1.2
     assert chi2.max() < 1.7
     assert found().misfit is None
+
+
+def _rough(spec: mujoco.MjSpec) -> None:
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            joint.frictionloss = 0.2
+
+
+@pytest.mark.slow
+def test_innovations_are_white_where_joints_stick_and_slip() -> None:
+    log = record_walk(Gait(), 4.0, edit=_rough)[0]
+    begun = make_study(load_robot("nao"), [log], threads=2)
+    terms = begun.declare(["coulomb_friction:*=shared"])
+    followed = begun
+    for _ in range(2):
+        followed = followed.with_initial_states(Model(terms, np.array([0.2])), held_out=False)
+
+    def chi2(study: Study, friction: float) -> float:
+        problem = study.train_problem(terms)
+        return float(np.mean(problem.column_chi2(problem.residuals(np.array([[friction]]))[0])))
+
+    # about the states, and by the derivatives, of a model without friction, friction only disturbs
+    right = chi2(followed, 0.2)
+    assert 0.5 < right < 1.4
+    assert chi2(begun, 0.2) > 1.5 * right
+    assert all(chi2(followed, other) > 1.02 * right for other in (0.1, 0.15, 0.25, 0.3))
+
+
+def test_derivatives_are_kept_where_they_foretell_what_a_step_does() -> None:
+    episode = study().train[0]
+    assert isinstance(episode, InnovationsEpisode)
+    assert episode.chain is not None
+    assert episode.known is not None
+    n = len(episode.log)
+    chain, known = episode.chain.part(0, n), episode.known.part(0, n)
+    values = Terms(chain.steps.terms).nominal
+    assert np.mean(stale(chain, known, values, 0)) < 0.05
+    other = replace(known, start=1.1 * known.start)
+    assert np.all(stale(chain, other, values, 0)[chain.linked])
+    some = np.arange(n - 1) % 3 == 0
+    mended = other.renewed(some, derive(chain, values, np.flatnonzero(some)))
+    assert np.mean(stale(chain, mended, values, 1)[some]) < 0.05
+    np.testing.assert_array_equal(mended.start[~some], other.start[~some])
 
 
 @pytest.mark.slow

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from sysid_btr.terms.base import BatchModel, Fields, JointAddresses, Term
 
 COARSE = 0.004
-"""s, longest step of the fourth-order integrator with which derivatives are taken."""
+"""s, longest step of the fourth-order integrator."""
+ROUGH, ROUGH_ERROR, CHECKED = 0.010, 0.05, 16
+"""s, the same for derivatives, where it changes those of so many of the steps by no more than this fraction."""
 STEADY, LEVER = 20.0, 0.07
 """Standard deviation of the mean force on a foot over a sample, in weights of the robot: as good as free. Times the
 lever (m) it is that of the torque."""
@@ -49,10 +51,14 @@ SLACKS = (1.0, 5.0, 25.0, 125.0)
 """Factors on it that are tried: a model that lacks something errs by more, and must not draw the states with it."""
 LOOSE = (0.1, 0.3, 1.0, 3.0, 0.1, 5.0)
 """Standard deviations by which a round may move the same: what nothing measures must stay somewhere."""
-NUDGE = (0.01, 0.001, 0.01, 0.01, 0.001, 0.02)
-"""Changes of the same by which derivatives are taken."""
-NUDGE_FORCE, NUDGE_TORQUE = 1.0, 0.1
+NUDGE = (0.01, 0.001, 0.01, 0.01, 0.001, 0.1)
+"""Changes of the same, either way, by which derivatives are taken: about as large as what is not known of them, so
+that a joint which sticks or slips within it has the slope that serves both (statistical linearisation: Garcia-Fernandez
+et al. 2017, doi:10.1109/TAC.2016.2592681)."""
+NUDGE_FORCE, NUDGE_TORQUE = 5.0, 0.5
 """... and of forces, N, and torques, Nm."""
+STALE = 0.2
+"""By how much derivatives may fail to foretell the change of a state, fractions of these."""
 NUDGE_NUMBER = 0.02
 """Changes of the numbers by which derivatives are taken, fractions of their ranges."""
 LATE = 0.001
@@ -134,6 +140,13 @@ class Derivatives:
     mean: FloatArray
     blow: FloatArray
     last: FloatArray
+
+    def renewed(self, which: BoolArray, found: Derivatives) -> Derivatives:
+        """The same with those of some steps found anew."""
+        mixed = {f.name: getattr(self, f.name).copy() for f in fields(self)}
+        for name, values in mixed.items():
+            values[which] = getattr(found, name)
+        return Derivatives(**mixed)
 
     def part(self, start: int, stop: int) -> Derivatives:
         """Those of the steps between the samples from `start` to before `stop`."""
@@ -324,41 +337,83 @@ LOWEST_LOADED, LIGHTEST = 0.002, 0.01
 beyond which it does."""
 
 
-def derive(chain: Chain, values: FloatArray) -> Derivatives:
-    """How the end of each step depends on its start and the forces in it, which hardly depends on the numbers."""
-    steps, d = _coarse(chain), chain.states.std.shape[1]
-    w, forces = len(chain.touch), chain.touch.shape[1] * 6
-    size = each_of(NUDGE, chain)
-    # without contact nothing depends on where the base is, and its velocity only adds to where it gets
-    lanes = np.array([3, 4, 5, 9, 10, 11, *range(BASE, d)])
-    nudges = np.zeros((1 + len(lanes) + forces, d + forces))
-    nudges[1 + np.arange(len(lanes)), lanes] = size[lanes]
-    kinds = chain.size.force(1.0) * np.tile([NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3, forces // 6)
-    nudges[1 + len(lanes) + np.arange(forces), d + np.arange(forces)] = kinds
-    count = len(nudges)
-    change = np.empty((w, count, d))
-    for first in range(0, w, TOGETHER):
-        own = np.arange(first, min(first + TOGETHER, w))
+def derive(chain: Chain, values: FloatArray, which: IntArray | None = None) -> Derivatives:
+    """How the end of each step depends on its start and the forces in it, about its states under a candidate.
+
+    `which` steps (k,) are asked for; without it all.
+    """
+    which = np.arange(len(chain.touch)) if which is None else which
+    size, kinds, lanes = each_of(NUDGE, chain), _nudged_forces(chain), _lanes(chain)
+    up = np.diag(np.concatenate([size, kinds]))[None, np.concatenate([lanes, len(size) + np.arange(len(kinds))])]
+    fine, rough = (_stepped(chain, longest) for longest in (COARSE, ROUGH))
+    some = which[np.unique(np.linspace(0, len(which) - 1, CHECKED).astype(np.int64))]
+    wanted = _responses(chain, fine, values, some, up) / size
+    off = _responses(chain, rough, values, some, up) / size - wanted
+    close = np.linalg.norm(off) < ROUGH_ERROR * np.linalg.norm(wanted)
+    found = _responses(chain, rough if close else fine, values, which, up)
+    start = np.tile(np.eye(len(size)), (len(which), 1, 1))
+    start[:, [0, 1, 2], [6, 7, 8]] = np.diff(chain.steps.log.time)[which, None]
+    start[:, :, lanes] = np.moveaxis(found[:, : len(lanes)], 1, 2) / size[lanes]
+    mean = np.moveaxis(found[:, len(lanes) :], 1, 2) / kinds
+    on = np.repeat(chain.touch[which], 6, axis=1)[:, None]
+    first, last = (_blows(chain, values, samples) for samples in (which, 1 + which))
+    return Derivatives(start, mean * on, start @ first * on, last * on)
+
+
+def stale(chain: Chain, known: Derivatives, values: FloatArray, number: int) -> BoolArray:
+    """Steps (w,) of whose ends the derivatives do not foretell what a change of everything at once makes of them.
+
+    `number` says which change: nudges of random signs.
+    """
+    size, kinds, lanes = each_of(NUDGE, chain), _nudged_forces(chain), _lanes(chain)
+    on = np.zeros(len(size))
+    on[lanes] = size[lanes]
+    sign = np.random.default_rng(number).choice([-0.5, 0.5], size=len(size) + len(kinds))
+    touch = np.repeat(chain.touch, 6, axis=1)
+    change = sign * np.hstack([np.tile(on, (len(touch), 1)), kinds * touch])
+    every = np.arange(len(touch))
+    found = _responses(chain, _stepped(chain, ROUGH), values, every, change[:, None])[:, 0]
+    foretold = (np.concatenate([known.start, known.mean], axis=2) @ change[:, :, None])[:, :, 0]
+    off = np.abs(found - foretold)[:, lanes] / size[lanes]
+    return np.asarray(chain.linked & ~(off.max(axis=1) < STALE))
+
+
+def _lanes(chain: Chain) -> IntArray:
+    """Of a state, what matters: without contact nothing depends on where the base is, and its velocity only adds."""
+    return np.array([3, 4, 5, 9, 10, 11, *range(BASE, chain.states.std.shape[1])])
+
+
+def _nudged_forces(chain: Chain) -> FloatArray:
+    """(6 f,) changes of forces and torques by which derivatives are taken."""
+    kinds = [NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3
+    return np.asarray(chain.size.force(1.0) * np.tile(kinds, chain.touch.shape[1]))
+
+
+def _responses(chain: Chain, steps: SampleSteps, values: FloatArray, which: IntArray, up: FloatArray) -> FloatArray:
+    """(k, l, d) half the difference that changes `up` (k or 1, l, d + 6 f) and down make to the ends of some steps."""
+    half, wide = up.shape[1], np.broadcast_to(up, (len(which), *up.shape[1:]))
+    count = 2 * half
+    result = np.empty((len(which), half, chain.states.std.shape[1]))
+    for first in range(0, len(which), TOGETHER):
+        own = which[first : first + TOGETHER]
         segment, lane = np.repeat(own, count), np.tile(np.arange(count), len(own))
-        ends = steps.ends(values[None], np.zeros(len(segment), dtype=np.int64), segment, nudges[lane])
-        plain = np.repeat(np.arange(len(own)) * count, count)
-        change[own] = difference(ends, ends.chosen(plain)).reshape(len(own), count, d)
-    start = np.tile(np.eye(d), (w, 1, 1))
-    start[:, [0, 1, 2], [6, 7, 8]] = np.diff(chain.steps.log.time)[:, None]
-    start[:, :, lanes] = np.moveaxis(change[:, 1 : 1 + len(lanes)], 1, 2) / size[lanes]
-    mean = np.moveaxis(change[:, 1 + len(lanes) :], 1, 2) / kinds
-    on = np.repeat(chain.touch, 6, axis=1)[:, None]
-    blows = _blows(chain, values)
-    return Derivatives(start, mean * on, start @ blows[:-1] * on, blows[1:] * on)
+        nudges = np.concatenate([wide[first : first + TOGETHER], -wide[first : first + TOGETHER]], axis=1)
+        nudges = nudges.reshape(len(segment), -1)
+        ends = steps.ends(values[None], np.zeros(len(segment), dtype=np.int64), segment, nudges)
+        raised = np.flatnonzero(lane < half)
+        change = difference(ends.chosen(raised), ends.chosen(raised + half))
+        result[first : first + TOGETHER] = 0.5 * change.reshape(len(own), half, -1)
+    return result
 
 
-def _coarse(chain: Chain) -> SampleSteps:
-    step, steps = whole_step(float(chain.time[1]), chain.size.time(COARSE)), chain.steps
-    return replace(steps, numerics=replace(steps.numerics, integrator="RK4", timestep=step))
+def _stepped(chain: Chain, longest: float) -> SampleSteps:
+    """Steps of a sample with a step of the fourth-order integrator that divides it."""
+    step = whole_step(float(chain.time[1]), chain.size.time(longest))
+    return replace(chain.steps, numerics=replace(chain.steps.numerics, integrator="RK4", timestep=step))
 
 
-def _blows(chain: Chain, values: FloatArray) -> FloatArray:
-    """Change of a state under unit blows (Ns, Nms) on its feet, (n, d, 6 f)."""
+def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
+    """Change of the states at some samples under unit blows (Ns, Nms) on the feet, (k, d, 6 f)."""
     import mujoco
 
     steps, states = chain.steps, chain.states
@@ -369,8 +424,8 @@ def _blows(chain: Chain, values: FloatArray) -> FloatArray:
     joints = len(index.joints)
     rows = np.concatenate([np.arange(6, BASE), BASE + joints + np.arange(joints)])
     jacobian, blow = np.zeros((len(steps.feet), 6, model.nv)), np.zeros((6 * len(steps.feet), model.nv))
-    result = np.zeros((len(states), states.std.shape[1], len(blow)))
-    for k in range(len(states)):
+    result = np.zeros((len(samples), states.std.shape[1], len(blow)))
+    for own_result, k in zip(result, samples, strict=True):
         data.qpos[place : place + 3] = states.free_base.position[k]
         data.qpos[place + 3 : place + 7] = states.free_base.quaternion[k]
         data.qpos[index.qpos] = states.joint_position[k]
@@ -378,7 +433,7 @@ def _blows(chain: Chain, values: FloatArray) -> FloatArray:
         for own, body in zip(jacobian, steps.feet, strict=True):
             mujoco.mj_jacBodyCom(model, data, own[:3], own[3:], body)
         mujoco.mj_solveM(model, data, blow, jacobian.reshape(blow.shape))
-        result[k, rows] = blow.T[order]
+        own_result[rows] = blow.T[order]
     return result
 
 
@@ -408,7 +463,7 @@ def simulate_chain(chain: Chain, values: FloatArray, free: IntArray, step: Float
     candidates[1 + np.arange(len(free)), free] += step
     count = len(candidates)
     row, segment = np.tile(np.arange(count), w), np.repeat(every, count)
-    coarse = _coarse(chain)
+    coarse = _stepped(chain, COARSE)
     around = coarse.ends(candidates, row, segment, None)
     plain = around.chosen(every * count)
     by_number = difference(around, plain.chosen(segment)).reshape(w, count, -1)[:, 1:] / step[:, None]

@@ -39,6 +39,7 @@ from sysid_btr.floating_base.chain import (
     moved_chain,
     remembers,
     simulate_chain,
+    stale,
     unexplained,
 )
 from sysid_btr.floating_base.episode import MOST_WALKED, reconstruct
@@ -391,7 +392,7 @@ class InnovationsEpisode(Episode):
     def with_initial_states(
         self, compare: Callable[[], Comparison], values: FloatArray, coarse: Numerics, *, anew: bool = True
     ) -> Self:
-        """The same about the states that are most probable under a candidate; derivatives hardly depend on it."""
+        """The same about the states that are most probable under a candidate."""
         replay = compare().replay
         found = self if self.chain is not None else self._begun(coarse, replay.threads)
         if len(values) == 0:
@@ -401,8 +402,8 @@ class InnovationsEpisode(Episode):
         n = len(self.log)
         chain, known = found.chain.part(0, n), found.known.part(0, n)
         chain = replace(chain, steps=replace(chain.steps, terms=replay.terms, numerics=coarse, threads=replay.threads))
-        chain, own = follow_states(chain, known, values, ROUNDS)
-        return replace(found, chain=chain, known=known, filter=own)
+        chain, known = follow_states(chain, known, values, ROUNDS)
+        return replace(found, chain=chain, known=known, filter=filter_at(chain, known, values))
 
     def _begun(self, numerics: Numerics, threads: int) -> Self:
         """About the most probable states of all of the recording in the plain model."""
@@ -420,8 +421,8 @@ class InnovationsEpisode(Episode):
                     f"states as measured, with steps of {1e3 * numerics.timestep:.3g} ms. Check armature and masses: a "
                     "body without mass is the usual cause."
                 )
-            chain, own = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
-            return chain, known, own
+            chain, known = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
+            return chain, known, filter_at(chain, known, terms.nominal)
 
         key = ("innovations", self.robot.fingerprint, self.robot.at, numerics)
         chain, known, own = self.recording.once(key, begin)
@@ -453,8 +454,8 @@ def _of_innovations(target: Target, own: Filter) -> Target:
     return replace(target, floor=tuple(floor))
 
 
-def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: int) -> tuple[Chain, Filter]:
-    """A chain about its most probable states under a candidate, and the filter there."""
+def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: int) -> tuple[Chain, Derivatives]:
+    """A chain about its most probable states under a candidate, and its derivatives there."""
     terms = Terms(chain.steps.terms)
     numbers, step = np.arange(len(values)), NUDGE_NUMBER * (terms.upper - terms.lower)
     for k in range(rounds):
@@ -467,6 +468,15 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
         if not np.isfinite(found.surprise):
             break
         chain = moved_chain(chain, known, found, np.zeros(ends.by_number.shape[2]))
-    ends = simulate_chain(chain, values, numbers[:0], step[:0])
+        # they hardly depend on numbers or states, but where joints stick and slip they do
+        old = stale(chain, known, values, k)
+        if old.any():
+            known = known.renewed(old, derive(chain, values, np.flatnonzero(old)))
+    return chain, known
+
+
+def filter_at(chain: Chain, known: Derivatives, values: FloatArray) -> Filter:
+    """The filter of a chain about its states under a candidate."""
+    ends = simulate_chain(chain, values, np.arange(0), np.zeros(0))
     # the right model errs by no more than the least slack
-    return chain, kalman_filter(replace(chain, slack=1.0), known, ends.by_number[:, :, -1])
+    return kalman_filter(replace(chain, slack=1.0), known, ends.by_number[:, :, -1])
