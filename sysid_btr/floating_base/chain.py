@@ -37,7 +37,10 @@ if TYPE_CHECKING:
 COARSE = 0.004
 """s, longest step of the fourth-order integrator."""
 ROUGH, ROUGH_ERROR, CHECKED = 0.010, 0.05, 16
-"""s, the same for derivatives, where it changes those of so many of the steps by no more than this fraction."""
+"""s, longest step for derivatives, where these differ by no more than this fraction from those of `COARSE` on so many
+samples."""
+BLIND = (0, 1, 2, 6, 7, 8)
+"""Of a state: position and velocity of the base, on which without contact nothing else depends."""
 STEADY, LEVER = 20.0, 0.07
 """Standard deviation of the mean force on a foot over a sample, in weights of the robot: as good as free. Times the
 lever (m) it is that of the torque."""
@@ -58,7 +61,7 @@ et al. 2017, doi:10.1109/TAC.2016.2592681)."""
 NUDGE_FORCE, NUDGE_TORQUE = 5.0, 0.5
 """... and of forces, N, and torques, Nm."""
 STALE = 0.2
-"""By how much derivatives may fail to foretell the change of a state, fractions of these."""
+"""Error of a change of state that derivatives may predict, fractions of `NUDGE`."""
 NUDGE_NUMBER = 0.02
 """Changes of the numbers by which derivatives are taken, fractions of their ranges."""
 LATE = 0.001
@@ -343,8 +346,8 @@ def derive(chain: Chain, values: FloatArray, which: IntArray | None = None) -> D
     `which` steps (k,) are asked for; without it all.
     """
     which = np.arange(len(chain.touch)) if which is None else which
-    size, kinds, lanes = each_of(NUDGE, chain), _nudged_forces(chain), _lanes(chain)
-    up = np.diag(np.concatenate([size, kinds]))[None, np.concatenate([lanes, len(size) + np.arange(len(kinds))])]
+    size, kinds, felt = each_of(NUDGE, chain), _nudged_forces(chain), _felt(chain)
+    up = np.diag(np.concatenate([size, kinds]))[None, np.concatenate([felt, len(size) + np.arange(len(kinds))])]
     fine, rough = (_stepped(chain, longest) for longest in (COARSE, ROUGH))
     some = which[np.unique(np.linspace(0, len(which) - 1, CHECKED).astype(np.int64))]
     wanted = _responses(chain, fine, values, some, up) / size
@@ -353,34 +356,34 @@ def derive(chain: Chain, values: FloatArray, which: IntArray | None = None) -> D
     found = _responses(chain, rough if close else fine, values, which, up)
     start = np.tile(np.eye(len(size)), (len(which), 1, 1))
     start[:, [0, 1, 2], [6, 7, 8]] = np.diff(chain.steps.log.time)[which, None]
-    start[:, :, lanes] = np.moveaxis(found[:, : len(lanes)], 1, 2) / size[lanes]
-    mean = np.moveaxis(found[:, len(lanes) :], 1, 2) / kinds
+    start[:, :, felt] = np.moveaxis(found[:, : len(felt)], 1, 2) / size[felt]
+    mean = np.moveaxis(found[:, len(felt) :], 1, 2) / kinds
     on = np.repeat(chain.touch[which], 6, axis=1)[:, None]
     first, last = (_blows(chain, values, samples) for samples in (which, 1 + which))
     return Derivatives(start, mean * on, start @ first * on, last * on)
 
 
 def stale(chain: Chain, known: Derivatives, values: FloatArray, number: int) -> BoolArray:
-    """Steps (w,) of whose ends the derivatives do not foretell what a change of everything at once makes of them.
+    """Steps (w,) of which the derivatives do not predict the change under random changes of their start and forces.
 
-    `number` says which change: nudges of random signs.
+    `number` says which of these: half of each nudge, with a random sign.
     """
-    size, kinds, lanes = each_of(NUDGE, chain), _nudged_forces(chain), _lanes(chain)
+    size, kinds, felt = each_of(NUDGE, chain), _nudged_forces(chain), _felt(chain)
     on = np.zeros(len(size))
-    on[lanes] = size[lanes]
+    on[felt] = size[felt]
     sign = np.random.default_rng(number).choice([-0.5, 0.5], size=len(size) + len(kinds))
     touch = np.repeat(chain.touch, 6, axis=1)
     change = sign * np.hstack([np.tile(on, (len(touch), 1)), kinds * touch])
     every = np.arange(len(touch))
     found = _responses(chain, _stepped(chain, ROUGH), values, every, change[:, None])[:, 0]
-    foretold = (np.concatenate([known.start, known.mean], axis=2) @ change[:, :, None])[:, :, 0]
-    off = np.abs(found - foretold)[:, lanes] / size[lanes]
+    predicted = (np.concatenate([known.start, known.mean], axis=2) @ change[:, :, None])[:, :, 0]
+    off = np.abs(found - predicted)[:, felt] / size[felt]
     return np.asarray(chain.linked & ~(off.max(axis=1) < STALE))
 
 
-def _lanes(chain: Chain) -> IntArray:
-    """Of a state, what matters: without contact nothing depends on where the base is, and its velocity only adds."""
-    return np.array([3, 4, 5, 9, 10, 11, *range(BASE, chain.states.std.shape[1])])
+def _felt(chain: Chain) -> IntArray:
+    """Coordinates of a state on which the end of a step depends, beside the base's own way."""
+    return np.delete(np.arange(chain.states.std.shape[1]), BLIND)
 
 
 def _nudged_forces(chain: Chain) -> FloatArray:

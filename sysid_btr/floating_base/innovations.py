@@ -3,8 +3,9 @@
 A Kalman filter over the chain of a walk (`chain`) says of each sample what it adds to the past. Where the model is
 right these innovations are white noise of a known size (Kailath 1968, doi:10.1109/TAC.1968.1099025), and their sum of
 squares is minus twice the log likelihood of the log, its states and the forces on its feet integrated out (prediction
-error method: Astrom 1980, doi:10.1016/0005-1098(80)90078-3). Gains hardly depend on the numbers that are looked for,
-so a candidate costs one step of a sample from every state, and a recursion.
+error method: Astrom 1980, doi:10.1016/0005-1098(80)90078-3). Gains hardly depend on the numbers that are looked for
+but where joints stick and slip, so they stay as they are through a search and follow it from turn to turn: a candidate
+costs one step of a sample from every state, and a recursion.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError, ModelError
 from sysid_btr.floating_base.chain import (
+    BLIND,
     COARSE,
     LATE,
     LEAST,
@@ -64,8 +66,6 @@ FIRST_ROUNDS, ROUNDS = 4, 2
 """Gauss-Newton steps of the states, from reconstructed ones and from those of another candidate."""
 SETTLING = 0.3
 """s of a Nao (`BodySize`) after a beginning in which its unknown state, and commands from before it, still show."""
-BLIND = (0, 1, 2, 6, 7, 8)
-"""Of a state: position and velocity of the base, on which without contact nothing else depends."""
 
 
 @dataclass(frozen=True)
