@@ -11,6 +11,7 @@ from sysid_btr.estimators.base import Budget, Progress, silent
 from sysid_btr.identify.numerics import held_numerics
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten
 from sysid_btr.identify.study import Study
+from sysid_btr.identify.thresholds import with_reached_limits, without_unreached_limits
 from sysid_btr.terms.model import Model
 
 MISFIT = 1.5
@@ -54,9 +55,13 @@ def realise_servo(study: Study, model: Model) -> Study:
 
 def first_fit(study: Study, model: Model, budget: Budget, progress: Progress = silent) -> tuple[Study, Fitted]:
     """First fit: where initial states are uncertain, of them and the parameters in turn, by the coarse integrator."""
-    procedure, reference, spent = study.procedure, study.numerics, 0
+    procedure, reference = study.procedure, study.numerics
+    model, spent = with_reached_limits(study, model)
     if not procedure.alternations:
-        return study, refit(study, model, budget=budget, progress=progress)
+        found = refit(study, model, budget=budget.after(spent), progress=progress)
+        free, more = without_unreached_limits(study, found.model)
+        spent += found.evaluations + more
+        return study, judge(study, free, spent) if free is not found.model else replace(found, evaluations=spent)
     study = replace(study, numerics=study.coarse)
     model = model.at(best_start(study, model.terms, contact_starts(model)))
     for turn, iterations in enumerate(procedure.alternations, 1):
@@ -66,7 +71,8 @@ def first_fit(study: Study, model: Model, budget: Budget, progress: Progress = s
         model, spent = found.model, spent + found.evaluations
         last = turn == len(procedure.alternations)
         study = study.with_initial_states(model, held_out=last, anew=last)
-    study = replace(study, numerics=reference)
+    model, more = without_unreached_limits(study, model)
+    study, spent = replace(study, numerics=reference), spent + more
     if all(episode.procedure.coarse_suffices for episode in study.train):
         return study, judge(study, model, spent)
     # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model

@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, uses_residuals
+from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, uses_residuals
 from sysid_btr.estimators.chain import Chain, needs_residuals
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
@@ -19,6 +19,7 @@ from sysid_btr.identify.bounds import grow_bounds
 from sysid_btr.identify.coarse import realise_servo, weigh_columns
 from sysid_btr.identify.deferred import deferred_fit
 from sysid_btr.identify.discrepancy import widened
+from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
 from sysid_btr.identify.nuisance import assumptions, check_nuisance, error_of_the_rest
@@ -202,6 +203,9 @@ def fit(
     beyond = np.hypot(shift, error_of_the_rest(study, problem.model.at(at.values), at.jacobian))
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, beyond, known)
     if solved.by_residuals:
+        if known is None and solved.result.termination is not Termination.BUDGET_SPENT:
+            found, spent = followed(problem.parameters, found, problem, values, jacobian)
+            replays += spent
         values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))
         replays += spent
     before = score(study, model.at(values))

@@ -12,12 +12,14 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.objectives.covariance import Known, spread
+from sysid_btr.objectives.covariance import RANK, Known, spread
 from sysid_btr.terms.base import Parameter
 
 Identifiable = Literal["yes", "weak", "no"]
 NOT_IDENTIFIABLE = 0.15
 """Standard error, as a fraction of the range of the bounds, beyond which a log says nothing."""
+CONFOUNDED = 0.5
+"""Correlation from which two parameters are said to be confounded: a quarter of the variance of each is the other's."""
 TOGETHER = ("correlation", "change", "moves")
 """Of an estimate, what results have in ``correlation`` and ``sensitivity``."""
 
@@ -126,6 +128,18 @@ class Profile:
         }
 
 
+def responses(normal: FloatArray, index: int) -> FloatArray:
+    """Change (p,) of the best values of all parameters with that of one, in a linear model of this information."""
+    free = np.arange(len(normal)) != index
+    follow = np.zeros(len(normal))
+    follow[index] = 1.0
+    if free.any():
+        size = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
+        inner = normal[np.ix_(free, free)] / np.outer(size, size)
+        follow[free] = -np.linalg.pinv(inner, rcond=RANK, hermitian=True) @ (normal[free, index] / size) / size
+    return follow
+
+
 def estimates(
     parameters: Sequence[Parameter],
     values: FloatArray,
@@ -203,6 +217,8 @@ def identifiability(
         return "yes", ""
     alone = 1 / norm[i] if norm[i] > 0 else np.inf
     state: Identifiable = "no" if std[i] > NOT_IDENTIFIABLE * span else "weak"
+    if np.isinf(alone):
+        return state, "no sensor of this log responds to it"
     if alone > 0.5 * min(std[i], NOT_IDENTIFIABLE * span):
         return state, (
             "hardly any sensor of this log responds to it: even with all else known, "
@@ -214,6 +230,9 @@ def identifiability(
     correlation[i] = 0.0
     correlation[~np.isfinite(correlation)] = 0.0
     partner = int(np.argmax(np.abs(correlation)))
+    if abs(correlation[partner]) < CONFOUNDED:
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        return state, f"its standard error is more than {parameter.scale:.2g}{unit}, a change that matters"
     sign = "difference" if correlation[partner] > 0 else "sum"
     return state, (
         f"confounded on this log with {parameters[partner].name} (correlation {correlation[partner]:+.2f}); their "

@@ -20,7 +20,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, FitResult, Problem, Progress, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.intervals import Profile
+from sysid_btr.identify.intervals import Profile, responses
 from sysid_btr.objectives.covariance import RANK, spread
 from sysid_btr.objectives.problem import Conditional
 from sysid_btr.progress import shows_progress, watched
@@ -134,7 +134,7 @@ def profile_curve(
     share = white / std**2 if known else 1.0
     threshold = float(student.ppf(0.975, dof[index])) ** 2
     step = np.sqrt(BEYOND * threshold) * min(std, span) / (points // 2) if known else span / (points - 1)
-    follow = _responses(normal, index)
+    follow = responses(normal, index)
     quick = replace(estimator, confirm=False, max_iterations=_ITERATIONS, tolerance=1e-5)
     low = list(_side(problem, quick, top.x, top.loss, index, -step, follow, share, threshold, points, progress))
     high = list(_side(problem, quick, top.x, top.loss, index, step, follow, share, threshold, points, progress))
@@ -203,18 +203,6 @@ def _side(
 
 def _fit(estimator: LeastSquares, problem: Problem, progress: Progress) -> FitResult:
     return estimator.fit(problem, rng=np.random.default_rng(0), budget=Budget(), journal=Journal(), progress=progress)
-
-
-def _responses(normal: FloatArray, index: int) -> FloatArray:
-    """Change (p,) of all parameters' best values with the held one, in the linear model."""
-    free = np.arange(len(normal)) != index
-    follow = np.zeros(len(normal))
-    follow[index] = 1.0
-    if free.any():
-        size = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
-        inner = normal[np.ix_(free, free)] / np.outer(size, size)
-        follow[free] = -np.linalg.pinv(inner, rcond=RANK, hermitian=True) @ (normal[free, index] / size) / size
-    return follow
 
 
 def _crossing(values: FloatArray, deviance: FloatArray, threshold: float, side: int) -> float | None:

@@ -98,6 +98,11 @@ class Effect(Term):
         return self
 
     @classmethod
+    def is_threshold(cls) -> bool:
+        """Whether it does nothing, to any order, up to some value of its main kind: a limit that is not reached."""
+        return cls.kinds[cls.main].name in cls.held
+
+    @classmethod
     def initial_guesses(cls, values: FloatArray) -> FloatArray:
         """Amounts (k, kinds) that a refit may begin from, given what a linear scan says (kinds,).
 
@@ -105,7 +110,7 @@ class Effect(Term):
         """
         if cls.signed:
             return values[None]
-        threshold = cls.kinds[cls.main].name in cls.held
+        threshold = cls.is_threshold()
         rungs = np.array(THRESHOLDS if threshold else GUESSES)
         anchor = 0.0 if threshold else cls.kinds[cls.main].nominal
         result = np.tile(values, (len(rungs), 1))
