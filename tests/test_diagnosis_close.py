@@ -14,7 +14,7 @@ import toys
 
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
-from sysid_btr.diagnosis.elimination import exchange
+from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, where_something_is
 from sysid_btr.diagnosis.search import search
@@ -386,7 +386,7 @@ def test_what_was_chosen_before_the_rest_was_known_is_compared_again() -> None:
     assert {e.name for e in state.effects} == {"viscous_damping", "coulomb_friction"}
     gain = Hypothesis(Kp, toys.LEG_JOINTS, True, np.array([0.97]), 0.0)
     state = replace(state, evidence=tuple(replace(e, alternatives=(gain,)) for e in state.evidence))
-    state = exchange(state, STANDARD)
+    state = exchange(state, (ViscousDamping, CoulombFriction, Kp), STANDARD)
     assert [e.name for e in state.effects] == ["coulomb_friction", "kp"]
     assert [(e.family, e.others) for e in state.evidence][1] == (pytest.approx(1.0, abs=1e-3), {})
     assert state.fitted.model.values[-1] == pytest.approx(TRUE_KP, rel=0.01)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from toys import PENDULUM, pendulum, robot_from_xml, swing
 
-from sysid_btr.diagnosis.search import leading_hypotheses
+from sysid_btr.diagnosis.leads import leading_hypotheses
 from sysid_btr.diagnosis.selection import STANDARD
 from sysid_btr.diagnosis.state import State
 from sysid_btr.errors import LogError, UsageError

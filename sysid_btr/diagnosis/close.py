@@ -82,8 +82,9 @@ def close(
     while True:
         first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
         state = State.of(first, journal)
-        state = search(state, usable_effects(asked, study), selection, progress)
-        state = with_discrepancy(eliminate(state, selection, progress))
+        library = usable_effects(asked, study)
+        state = search(state, library, selection, progress)
+        state = with_discrepancy(eliminate(state, library, selection, progress))
         floating = state.study.procedure.leaves_ground_error
         named = named_effects(state, selection)
         verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)

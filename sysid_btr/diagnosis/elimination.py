@@ -9,8 +9,10 @@ from math import nan
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.evidence import Evidence, evidence_of
+from sysid_btr.diagnosis.evidence import Evidence
+from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.leads import Library
 from sysid_btr.diagnosis.selection import (
     Selection,
     agree,
@@ -32,14 +34,15 @@ SETTLED = 0.01
 """Change of the misfit, as a fraction, below which states and parameters are no longer updated in turn."""
 
 
-def eliminate(state: State, rules: Selection, progress: Progress) -> State:
+def eliminate(state: State, library: Library, rules: Selection, progress: Progress) -> State:
     """The model with only those effects that data want, at the optimum and with intervals."""
     state, removed = _prune(state, rules)
     if removed:
         state = state.step(removed=removed)
     if not state.effects:
         return state
-    state = _merged(exchange(state, rules), rules)
+    progress(done=state.replays, total=None, best=nan, note="each effect against what else it may be")
+    state = _merged(exchange(state, library, rules), rules)
     for _ in range(state.study.procedure.last_turns):
         # they were those of a model that lacked its last effect
         study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)
@@ -118,37 +121,6 @@ def _at_fewer_locations(state: State, effect: Effect, rules: Selection) -> tuple
         return state, ()
     own = state.evidence[state.effects.index(effect)]
     return replace(state, fitted=left.fitted, evidence=(*state.without_evidence_of(effect), own)), dropped
-
-
-def exchange(state: State, rules: Selection) -> State:
-    """The model with each effect compared once more with what else it may be, now that the others are known.
-
-    What was added first was chosen while the others were still missing.
-    """
-    for effect, evidence in zip(state.effects, state.evidence, strict=True):
-        model = state.fitted.model
-        own = Hypothesis(type(effect), effect.places, effect.shared, model.own(effect), 0.0)
-        trials = [Trial(own, state.fitted)]
-        trials += [attempt(state.study, model.without(effect), h, rules) for h in evidence.alternatives]
-        if len(trials) == 1:
-            continue
-        state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
-        winner = clearly_better(rules, trials)
-        known = evidence_of(rules, winner, trials)
-        at = state.effects.index(effect)
-        if winner is trials[0]:
-            state = replace(state, evidence=(*state.evidence[:at], known, *state.evidence[at + 1 :]))
-        else:
-            gone = (f"{effect.name} at {', '.join(effect.places)}",)
-            state = replace(state, fitted=winner.fitted, evidence=(*state.without_evidence_of(effect), known))
-            state = state.step(added=(str(winner.hypothesis),), removed=gone)
-    return state
-
-
-def clearly_better(rules: Selection, trials: Sequence[Trial]) -> Trial:
-    """The first of several trials, unless another predicts held-out data better by what simplicity is worth."""
-    best = min(trials, key=lambda t: t.fitted.misfit if np.isfinite(t.fitted.holdout) else np.inf)
-    return best if best.fitted.misfit < trials[0].fitted.misfit - rules.simpler else trials[0]
 
 
 def _merged(state: State, rules: Selection) -> State:

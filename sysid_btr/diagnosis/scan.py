@@ -63,6 +63,31 @@ class Sensitivity:
     values: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """What is to be explained, beside what the parameters can do.
+
+    Attributes
+    ----------
+    basis : (r, k) orthonormal, of what the parameters can do.
+    rest : (r,) the residual off it.
+    """
+
+    basis: FloatArray
+    rest: FloatArray
+
+    @classmethod
+    def of(cls, residual: FloatArray, jacobian: FloatArray) -> Residual:
+        """A residual (r,) beside parameters with these derivatives (r, p)."""
+        basis = _orthonormal(jacobian)
+        return cls(basis, residual - basis @ (basis.T @ residual))
+
+    @property
+    def least(self) -> float:
+        """Squared response below which a log cannot show an effect."""
+        return NO_RESPONSE * float(self.rest @ self.rest) / len(self.rest)
+
+
 def perturbations(
     effects: Sequence[type[Effect]], places: dict[str, tuple[str, ...]], scales: Scales
 ) -> list[Perturbation]:
@@ -107,17 +132,32 @@ def scan(
     list of Sensitivity
         Those that respond at all, best first.
     """
-    basis = _orthonormal(jacobian)
-    rest = residual - basis @ (basis.T @ residual)
+    return responding(problem, values, [Residual.of(residual, jacobian)], asked, scales, rules)[0]
+
+
+def responding(
+    problem: ReplayProblem,
+    values: FloatArray,
+    residuals: Sequence[Residual],
+    asked: Sequence[Perturbation],
+    scales: Scales,
+    rules: Selection,
+) -> list[list[Sensitivity]]:
+    """The same for several residuals, (r,) each, beside different parameters: every perturbation is simulated once.
+
+    What it does is simulated in the model of `problem` at `values`; what it explains is judged for each residual.
+    """
     plain = [q for q in asked if not _costly(q)]
-    found = _simulate(problem, values, rest, basis, plain, scales) if plain else []
-    costly = where_something_is(plain, found, [q for q in asked if _costly(q)], rules)
-    laws = [q for q in costly if not q.effect.structural]
-    if laws:
-        found += _simulate(problem, values, rest, basis, laws, scales)
-    for batch in _by_structure([q for q in costly if q.effect.structural], problem):
-        found += _simulate(problem, values, rest, basis, batch, scales)
-    return sorted(found, key=lambda t: -t.gain)
+    found = _simulate(problem, values, residuals, plain, scales) if plain else [[] for _ in residuals]
+    dear = [q for q in asked if _costly(q)]
+    near = {q for own in found for q in where_something_is(plain, own, dear, rules)}
+    costly = [q for q in dear if q in near]
+    batches = [[q for q in costly if not q.effect.structural]]
+    batches += _by_structure([q for q in costly if q.effect.structural], problem)
+    for batch in filter(None, batches):
+        for own, more in zip(found, _simulate(problem, values, residuals, batch, scales), strict=True):
+            own += more
+    return [sorted(own, key=lambda t: -t.gain) for own in found]
 
 
 def _costly(perturbation: Perturbation) -> bool:
@@ -184,14 +224,9 @@ def _by_structure(asked: list[Perturbation], problem: ReplayProblem) -> list[lis
 
 
 def _simulate(
-    problem: ReplayProblem,
-    values: FloatArray,
-    rest: FloatArray,
-    basis: FloatArray,
-    asked: list[Perturbation],
-    scales: Scales,
-) -> list[Sensitivity]:
-    """Simulate perturbations that share a set of terms."""
+    problem: ReplayProblem, values: FloatArray, residuals: Sequence[Residual], asked: list[Perturbation], scales: Scales
+) -> list[list[Sensitivity]]:
+    """Simulate perturbations that share a set of terms: those that respond at all, for each residual."""
     where = problem.where
     model, columns = Model(problem.terms, values), {}
     for effect in dict.fromkeys(q.effect for q in asked):
@@ -220,7 +255,7 @@ def _simulate(
     subtree_of_row = wide._subtrees[1]
     responses: dict[tuple[int, int], FloatArray | None] = {}
     rows_of = {subtree: np.flatnonzero(subtree_of_row == subtree) for subtree in groups}
-    everywhere = np.arange(len(rest))
+    everywhere = np.arange(len(subtree_of_row))
     asks = [[], *jobs]  # the first candidate asks nothing: the others are compared with it
     for first in range(0, len(candidates), BLOCK):
         block = wide.residuals(candidates[first : first + BLOCK])
@@ -231,20 +266,22 @@ def _simulate(
                 rows = rows_of.get(_subtree(asked[i], where), everywhere)
                 finite = np.isfinite(change).all()
                 responses[i, d] = change[rows] if finite else None
-    least = NO_RESPONSE * float(rest @ rest) / len(rest)
-    parts = {subtree: _Part(rows, basis[rows], rest[rows]) for subtree, rows in rows_of.items()}
-    whole = _Part(everywhere, basis, rest)
-    found = []
-    for i, perturbation in enumerate(asked):
-        seen = [responses[i, d] for d in range(len(perturbation.probe))]
-        known = [c for c in seen if c is not None]
-        if len(known) < len(seen):
-            continue
-        part = parts.get(_subtree(perturbation, where), whole)
-        answer = _judge(perturbation, part, np.column_stack(known), least, scales)
-        if answer is not None:
-            found.append(answer)
-    return found
+    judged: list[list[Sensitivity]] = []
+    for residual in residuals:
+        parts = {subtree: _Part.of(residual, rows) for subtree, rows in rows_of.items()}
+        whole = _Part.of(residual, everywhere)
+        found = []
+        for i, perturbation in enumerate(asked):
+            seen = [responses[i, d] for d in range(len(perturbation.probe))]
+            known = [c for c in seen if c is not None]
+            if len(known) < len(seen):
+                continue
+            part = parts.get(_subtree(perturbation, where), whole)
+            answer = _judge(perturbation, part, np.column_stack(known), residual.least, scales)
+            if answer is not None:
+                found.append(answer)
+        judged.append(found)
+    return judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +291,10 @@ class _Part:
     rows: IntArray
     basis: FloatArray
     rest: FloatArray
+
+    @classmethod
+    def of(cls, residual: Residual, rows: IntArray) -> _Part:
+        return cls(rows, residual.basis[rows], residual.rest[rows])
 
 
 def _judge(

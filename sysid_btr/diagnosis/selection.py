@@ -154,6 +154,14 @@ class Selection:
     common_amount: float = 0.05
     """Relative spread of amounts that are one amount, whatever their standard errors. Judgement."""
 
+    # --- what is exchanged ---
+
+    replaces: float = 0.7
+    """Fraction of what a part of the model explains that something else must promise, to first order, to be tried in
+    its place. Time: what promises less hardly ever does more."""
+    exchanges: int = 2
+    """Hypotheses that are tried in the place of a part, beside those that were weighed when it was added. Time."""
+
     # --- verdict ---
 
     explained: float = 0.975

@@ -1,0 +1,125 @@
+"""Exchange: every part of a model is compared once more with what else it may be, now that the others are known.
+
+What was added first was chosen while the others were still missing, and a part of it, at one place, may stand for
+something at another. (Floating search: Pudil, Novovicova and Kittler 1994, doi:10.1016/0167-8655(94)90127-9.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid_btr._typing import IntArray
+from sysid_btr.diagnosis.evidence import evidence_of
+from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.leads import Library, replacements
+from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.state import State
+from sysid_btr.diagnosis.trials import Trial, attempt
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.model import Model
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """An effect of the model, or that at one of its places."""
+
+    effect: Effect
+    places: tuple[str, ...]
+
+    @property
+    def whole(self) -> bool:
+        return self.places == self.effect.places
+
+    def columns(self, model: Model) -> IntArray:
+        """Positions of its numbers among the model's."""
+        every = np.arange(len(model.values))[model.terms.columns(self.effect)]
+        return every if self.whole else every.reshape(len(self.effect.places), -1)[self._kept(gone=True)].ravel()
+
+    def without(self, model: Model, state: State) -> Model:
+        """The model without it."""
+        if self.whole:
+            return model.without(self.effect)
+        kept = self._kept()
+        amounts = model.own(self.effect).reshape(len(self.effect.places), -1)[kept].ravel()
+        places = [self.effect.places[i] for i in kept]
+        fewer = type(self.effect).at(places, state.study.scales).around(amounts)
+        return model.replaced(self.effect, (fewer, amounts))
+
+    def hypothesis(self, model: Model) -> Hypothesis:
+        """It, as what it is compared with is given."""
+        return Hypothesis(
+            type(self.effect), self.places, self.whole and self.effect.shared, model.values[self.columns(model)], 0.0
+        )
+
+    def _kept(self, *, gone: bool = False) -> list[int]:
+        return [i for i, place in enumerate(self.effect.places) if (place in self.places) is gone]
+
+    def __str__(self) -> str:
+        return f"{self.effect.name} at {', '.join(self.places)}"
+
+
+def exchange(state: State, library: Library, rules: Selection) -> State:
+    """The model in which each part is what explains most in its place, beside all others.
+
+    Parameters
+    ----------
+    state : with effects.
+    library : effects that may stand in their places.
+    """
+    parts = _parts(state, rules)
+    # a single part was compared with all others when it was added
+    rescanned = len(parts) > 1 and not state.study.procedure.costly
+    columns = [part.columns(state.fitted.model) for part in parts]
+    leads = replacements(state, library, columns, rules) if rescanned else [[] for _ in parts]
+    for part, others in zip(parts, leads, strict=True):
+        if part.effect in state.effects:
+            state = _compared(state, part, others, rules)
+    return state
+
+
+def _parts(state: State, rules: Selection) -> list[_Part]:
+    """Every effect, and then every place of those at a few: what stands for one thing goes as one."""
+    whole = [_Part(effect, effect.places) for effect in state.effects]
+    several = [e for e in state.effects if not e.shared and 1 < len(e.places) <= rules.largest_group]
+    return whole + [_Part(effect, (place,)) for effect in several for place in effect.places]
+
+
+def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Selection) -> State:
+    """The state with a part as it is, or with what predicts better, or as well and is simpler, in its place."""
+    model, at = state.fitted.model, state.effects.index(part.effect)
+    hypotheses = list(others[: rules.exchanges])
+    if part.whole:
+        hypotheses += [h for h in state.evidence[at].alternatives if not _among(h, hypotheses)]
+    if not hypotheses:
+        return state
+    rest = part.without(model, state)
+    trials = [Trial(part.hypothesis(model), state.fitted)]
+    trials += [attempt(state.study, rest, hypothesis, rules) for hypothesis in hypotheses]
+    state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
+    winner = preferred(rules, trials)
+    known = evidence_of(rules, winner, trials)
+    if winner is trials[0]:
+        if not part.whole:
+            return state
+        return replace(state, evidence=(*state.evidence[:at], known, *state.evidence[at + 1 :]))
+    left = state.without_evidence_of(part.effect) if part.whole else state.evidence
+    state = replace(state, fitted=winner.fitted, evidence=(*left, known))
+    return state.step(added=(str(winner.hypothesis),), removed=(str(part),))
+
+
+def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:
+    return any(h.effect is hypothesis.effect and set(h.places) == set(hypothesis.places) for h in others)
+
+
+def preferred(rules: Selection, trials: Sequence[Trial]) -> Trial:
+    """The first of several trials, unless another predicts held-out data better, or as well and is simpler."""
+    own = trials[0]
+    finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
+    best = min(t.fitted.misfit for t in finite)
+    near = [t for t in finite if t.fitted.misfit <= best + rules.simpler]
+    if own in near:
+        near = [t for t in near if t is own or t.hypothesis.complexity < own.hypothesis.complexity]
+    return min(near, key=lambda t: (t.hypothesis.complexity, t is not own, t.fitted.misfit))

@@ -1,0 +1,131 @@
+"""Hypotheses that a scan of the model so far leads to: what may be missing, or stand where something else stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import get_args
+
+import numpy as np
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.diagnosis.free_form import free_forms
+from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
+from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, explained_by, perturbations, responding, scan
+from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.signature import proposals
+from sysid_btr.diagnosis.state import State
+from sysid_btr.estimators.journal import Record
+from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.missing_torque import missing_torques
+from sysid_btr.identify.refit import inflate, judge, shorten
+from sysid_btr.identify.study import Study
+from sysid_btr.models.robot import body_names, joint_names
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.base import Scope
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.free_form import FREE_FORMS
+from sysid_btr.terms.model import Model
+
+Library = Sequence[type[Effect]]
+
+
+def leading_hypotheses(state: State, library: Library, rules: Selection) -> tuple[list[Hypothesis], int]:
+    """The leading hypotheses of a scan, and how many perturbations were simulated; an interrupted run noted them."""
+    study, values = state.study, state.fitted.model.values[None]
+    places = (*joint_names(study.robot), *body_names(study.robot), "robot")
+    known = None if study.journal is None else study.journal.replay("scan", values, whole=True)
+    if known is not None:
+        return from_arrays(known.arrays, library, places), int(known.arrays["answers"])
+    began = perf_counter()
+    found, residuals = _scan(state, [e for e in library if e not in FREE_FORMS], rules)
+    hypotheses = form_hypotheses(found, residuals, rules)
+    hypotheses += _curves(state, library, rules)
+    if study.journal is not None:
+        arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
+        seconds = study.journal.seconds + perf_counter() - began
+        study.journal.append(Record("scan", values, arrays, seconds))
+    return hypotheses, len(found)
+
+
+def _curves(state: State, library: Library, rules: Selection) -> list[Hypothesis]:
+    """Of which variable what is missing is a smooth function: tried last, where no law says it more simply."""
+    asked = set(library) & set(FREE_FORMS)
+    if not asked:
+        return []
+    study, model = state.study, state.fitted.model
+    problem = study.train_problem(model)
+    forms = free_forms(problem, model.values, study.scales, missing_torques(problem, model.values, study.scales))
+    own = [f.hypothesis for f in forms if f.hypothesis.effect in asked]
+    return [h for h in own if h.gain >= rules.candidate_gain][: rules.curves]
+
+
+def replacements(state: State, library: Library, parts: Sequence[IntArray], rules: Selection) -> list[list[Hypothesis]]:
+    """What would explain, to first order, most of what each part of the model does: hypotheses, best first.
+
+    Parameters
+    ----------
+    state : with a model of p numbers.
+    parts : positions among these of the numbers of each part, which goes.
+    """
+    study, model = state.study, state.fitted.model
+    problem, residual, jacobian = _linear(study, model, rules)
+    asked = _perturbations(state, [e for e in library if e not in FREE_FORMS], problem, residual)
+    whole, without = Residual.of(residual, jacobian), []
+    for part in parts:
+        gone = jacobian[:, part] @ (model.terms.nominal[part] - model.values[part])
+        without.append(Residual.of(residual + gone, np.delete(jacobian, part, axis=1)))
+    found = responding(problem.with_numerics(study.cheap), model.values, without, asked, study.scales, rules)
+    result = []
+    for own, rest in zip(found, without, strict=True):
+        least = rules.replaces * float(rest.rest @ rest.rest - whole.rest @ whole.rest)
+        result.append([h for h in form_hypotheses(own, len(residual), rules) if h.gain >= least])
+    return result
+
+
+def _linear(study: Study, model: Model, rules: Selection) -> tuple[ReplayProblem, FloatArray, FloatArray]:
+    """What is scanned: the problem, and its residual (r,) and Jacobian (r, p) under the model so far."""
+    if study.procedure.shares:
+        # what is missing acts in proportion on short segments alone
+        study = _weighed(study.with_share(study.procedure.shares[0], model), model)
+    problem = shorten(study, rules.scan_seconds).train_problem(model)
+    return problem, *linearise(problem, model.values, step=study.stencil(model.terms))
+
+
+def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensitivity], int]:
+    """What every effect would do to the residual, best first, and the number of residuals."""
+    study, model = state.study, state.fitted.model
+    problem, residual, jacobian = _linear(study, model, rules)
+    asked = _perturbations(state, library, problem, residual)
+    if study.procedure.costly and len(asked) > rules.glance_most:
+        glance = shorten(study, rules.glance_seconds).train_problem(model)
+        linear = linearise(glance, model.values, step=study.stencil(model.terms))
+        seen = scan(glance, model.values, *linear, asked, study.scales, rules)
+        asked = [s.perturbation for s in seen[: rules.glance_most]]
+    # what is left is the right integrator's; what an effect would change may be a little off
+    cheap = problem.with_numerics(study.cheap)
+    found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
+    return found, len(residual)
+
+
+def _weighed(study: Study, model: Model) -> Study:
+    """The study with columns that count by what the model's own parameters leave in them, to first order."""
+    problem = study.train_problem(model)
+    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
+    left = residual - explained_by(jacobian, residual)
+    return inflate(study, replace(judge(study, model), train_columns=problem.column_chi2(left)))
+
+
+def _perturbations(state: State, library: Library, problem: ReplayProblem, residual: FloatArray) -> list[Perturbation]:
+    """What a scan asks for: a term already at a location is not, as it is refitted with everything else."""
+    study = state.study
+    places: dict[str, tuple[str, ...]] = {scope: study.robot.names(scope) for scope in get_args(Scope)}
+    asked: list[Perturbation] = perturbations(library, places, study.scales)
+    asked += proposals(study, problem, problem.start, residual, library)
+    terms = state.fitted.model.terms
+    present = {(type(t), p) for t in terms if t.numbers == t.kinds for p in t.places}
+    split = {p for t in terms if t.structural for p in t.places}
+    return [
+        q for q in asked if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
+    ]
