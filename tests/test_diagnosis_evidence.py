@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.diagnosis.certainty import STANDARD
-from sysid_btr.diagnosis.evidence import left_where_it_acts, share_explained, weights
+from sysid_btr.diagnosis.evidence import left_where_it_acts, preference, share_explained, weights
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.model import Model
@@ -71,6 +71,16 @@ def test_a_lead_that_one_stretch_decides_is_less_sure_than_one_of_all_stretches(
     firm = weights([left(steady, 20.0), other], other, [1, 1])[0]
     chance = weights([left(np.maximum(lucky, 0.0), 20.0), other], other, [1, 1])[0]
     assert firm > chance > 0.5
+
+
+def test_a_model_is_preferred_that_predicts_held_out_data_better_in_most_columns() -> None:
+    before = left(np.vstack([even(20.0), even(30.0)]), memory=COUNT)
+    assert preference(before, before) == pytest.approx(0.5)
+    better = left(np.vstack([even(10.0), even(29.0)]), memory=COUNT)
+    assert preference(before, better) > 0.95
+    assert preference(better, before) < 0.05
+    harmful = left(np.vstack([even(15.0), even(60.0)]), memory=COUNT)  # helps one column, and spoils another
+    assert preference(before, harmful) < 0.1
 
 
 @given(st.lists(st.floats(1.0, 50.0), min_size=2, max_size=6), st.integers(0, 5))

@@ -653,6 +653,7 @@ SURE, DOUBTFUL, EITHER = a_name(0.9), a_name(0.4), a_name(0.9, "backlash")
         (fitted([60.0]), (DOUBTFUL, SURE), False, "partly_explained"),
         (fitted([3.5]), (SURE, EITHER), False, "ambiguous"),
         (fitted([3.7]), (EITHER,), False, "partly_explained"),
+        (fitted([150.0]), (SURE,), False, "unexplained"),
     ],
 )
 def test_verdict(now: Fitted, named: Sequence[NamedEffect], floating: bool, expected: str) -> None:

@@ -74,6 +74,12 @@ def evidence_of(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Evi
     return Evidence(rivals, float(family), float(place), told, alternatives)
 
 
+def preference(before: Fitted, after: Fitted) -> float:
+    """Weight, 0 to 1, of a model against the one before it, on held-out data, which neither was fitted to."""
+    pair = np.stack([_heldout_density(model, after) for model in (before, after)])
+    return float(_shares(pair, np.zeros(2))[1])
+
+
 def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -> FloatArray:
     """Pseudo-BMA+ weights (m,) of models of the same data.
 
@@ -83,28 +89,34 @@ def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -
     best : whose residuals say how many independent samples a column has.
     parameters : (m,) that each has beside what all have; each costs as much as it gains by chance (Akaike 1974).
     """
-    density = np.stack([_log_density(model, best) for model in models])
+    density = np.stack([np.concatenate([_fitted_density(m, best), _heldout_density(m, best)]) for m in models])
+    return _shares(density, np.asarray(parameters, dtype=np.float64))
+
+
+def _shares(density: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Weights (m,) by log densities (m, stretches), less what each gains by its parameters (m,) by chance."""
     stretches = density.shape[1]
     # a fixed seed: the draws are an integral, and the result is the same for the same data
     shares = np.random.default_rng(0).dirichlet(np.ones(stretches), DRAWS)
-    total = stretches * shares @ density.T - np.asarray(parameters, dtype=np.float64)
+    total = stretches * shares @ density.T - parameters
     odds = np.exp(total - total.max(axis=1, keepdims=True))
     return np.asarray((odds / odds.sum(axis=1, keepdims=True)).mean(axis=0))
 
 
-def _log_density(model: Fitted, best: Fitted) -> FloatArray:
-    """Log density (stretches,) of all data under errors of the size that is left, in each column."""
-    parts = (
-        (model.train_cells, model.train_counts, model.train_columns, best.memory),
-        (model.holdout_cells, model.holdout_counts, model.holdout_columns, best.holdout_memory),
-    )
-    result = []
-    for cells, counts, chi2, memory in parts:
-        size = np.maximum(chi2, 1.0)[:, None]
-        each = counts * np.log(size) + cells / size
-        live = counts.sum(axis=0) > 0
-        result.append((-0.5 * each / memory[:, None]).sum(axis=0)[live])
-    return np.concatenate(result)
+def _fitted_density(model: Fitted, best: Fitted) -> FloatArray:
+    return _log_density(model.train_cells, model.train_counts, model.train_columns, best.memory)
+
+
+def _heldout_density(model: Fitted, best: Fitted) -> FloatArray:
+    return _log_density(model.holdout_cells, model.holdout_counts, model.holdout_columns, best.holdout_memory)
+
+
+def _log_density(cells: FloatArray, counts: FloatArray, chi2: FloatArray, memory: FloatArray) -> FloatArray:
+    """Log density (stretches,) under errors of the size that is left in each column, by its independent samples."""
+    size = np.maximum(chi2, 1.0)[:, None]
+    each = counts * np.log(size) + cells / size
+    live = counts.sum(axis=0) > 0
+    return np.asarray((-0.5 * each / memory[:, None]).sum(axis=0)[live])
 
 
 def left_where_it_acts(without: Fitted, now: Fitted) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import nan
 
 from sysid_btr.diagnosis.elimination import without_dispensable
-from sysid_btr.diagnosis.evidence import evidence_of
+from sysid_btr.diagnosis.evidence import evidence_of, preference
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
 from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain
 from sysid_btr.diagnosis.state import State
@@ -51,12 +51,13 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
 
 
 def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
-    """Whether a trial removes more than a trace; beside others, more than what these leave looks like.
+    """Whether a trial removes more than a trace, and beside others more than what these leave looks like.
 
-    At one moment that is a push, and of any variable some curve.
+    At one moment that is a push, and of any variable some curve. And whether the log says so, under errors as
+    correlated as those that are left: a part of a wrong model's error vanishes with almost anything.
     """
     effect, beside = trial.hypothesis.effect, bool(state.effects)
-    return has_minimum_gain(
+    more = has_minimum_gain(
         rules,
         state.before,
         state.fitted,
@@ -64,6 +65,7 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
         transient=effect.transient and beside,
         learnt=effect in FREE_FORMS and beside,
     )
+    return more and preference(state.fitted, trial.fitted) >= rules.evident
 
 
 def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:

@@ -121,6 +121,10 @@ class Selection:
     least_excess: float = 0.002
     """Excess that a column is taken to have at first, at least: it is divided by."""
 
+    evident: float = 0.5
+    """Weight of the model with an effect against that without it on held-out data (`evidence.preference`), from which
+    it is added: it must be the more likely of the two."""
+
     # --- which one of several ---
 
     simpler: float = 0.06

@@ -33,7 +33,8 @@ def verdict_of(
     parts = ((before.holdout, now.holdout), (before.train, now.train))
     if all(is_explained(rules, first, last, limit, floating=floating) for first, last in parts):
         return "ambiguous" if any(e.confused_with for e in named) else "explained"
-    return "partly_explained" if any(e.likely for e in named) else "unexplained"
+    # what predicts data that were not fitted worse than the model without it is no explanation
+    return "partly_explained" if any(e.likely for e in named) and now.holdout < before.holdout else "unexplained"
 
 
 def conclude(state: State, verdict: Verdict, named: Sequence[NamedEffect], rules: Selection, seconds: float) -> Closing:
