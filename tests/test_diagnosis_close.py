@@ -14,6 +14,7 @@ import toys
 
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
+from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, where_something_is
@@ -391,6 +392,24 @@ def test_what_was_chosen_before_the_rest_was_known_is_compared_again() -> None:
     assert [(e.family, e.others) for e in state.evidence][1] == (pytest.approx(1.0, abs=1e-3), {})
     assert state.fitted.model.values[-1] == pytest.approx(TRUE_KP, rel=0.01)
     assert "viscous_damping" in str(state.steps[-1].removed)
+
+
+def test_one_place_of_an_effect_that_stands_for_something_else_is_exchanged() -> None:
+    """Damping at two joints, of which one has dry friction: the other keeps its damping."""
+    log, rng = motion(), np.random.default_rng(0)
+    true = (ViscousDamping(("hip",)), CoulombFriction(KNEE))
+    shown = toys.run(toys.leg(), log, true, [0.3, 0.15], OTHERWISE).position[0]
+    noisy = {f"position.{j}": shown[:, i] + rng.normal(0, 4e-4, len(log)) for i, j in enumerate(toys.LEG_JOINTS)}
+    study = make_study(toys.leg(), [replace(log, channels={**log.channels, **noisy})], threads=1)
+    state = State.of(fit(study, ["kp:*=shared"]), None)
+    wrong = Hypothesis(ViscousDamping, ("hip", "knee"), False, np.array([0.3, 0.1]), 0.0)
+    state = replace(state, fitted=attempt(study, state.fitted.model, wrong, STANDARD).fitted, evidence=(Evidence(),))
+    state = exchange(state, (ViscousDamping, CoulombFriction, JointSpring), STANDARD)
+    assert [(e.name, e.places) for e in state.effects] == [("viscous_damping", ("hip",)), ("coulomb_friction", KNEE)]
+    assert len(state.evidence) == 2
+    np.testing.assert_allclose(state.fitted.model.values[1:], [0.3, 0.15], rtol=0.03)
+    assert state.steps[-1].removed == ("viscous_damping at knee",)
+    assert exchange(state, (ViscousDamping, CoulombFriction, JointSpring), STANDARD).effects == state.effects
 
 
 # --- where and when it shows -------------------------------------------------------------------------------
