@@ -90,7 +90,9 @@ def _parts(state: State, rules: Selection) -> list[_Part]:
 def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Selection) -> State:
     """The state with a part as it is, or with what predicts better, or as well and is simpler, in its place."""
     model, at = state.fitted.model, state.effects.index(part.effect)
-    hypotheses = list(others[: rules.exchanges])
+    # a generalisation of what is there would have taken its place in the search
+    others = [h for h in others if part.effect.name not in h.effect.includes]
+    hypotheses = others[: rules.exchanges]
     if part.whole:
         hypotheses += [h for h in state.evidence[at].alternatives if not _among(h, hypotheses)]
     if not hypotheses:
