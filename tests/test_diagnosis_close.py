@@ -40,10 +40,10 @@ from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, ViscousD
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.model import Model
-from sysid_btr.terms.sensing import EncoderOffset, SensorDelay
+from sysid_btr.terms.sensing import EncoderCyclicError, EncoderOffset, SensorDelay
 from sysid_btr.terms.servo import CommandDelay, IntegralGain, Kp
 from sysid_btr.terms.spring import JointSpring
-from sysid_btr.terms.transmission import Backlash, JointCompliance
+from sysid_btr.terms.transmission import Backlash, Cogging, JointCompliance
 from sysid_btr.writeback.write import identified
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"
@@ -316,6 +316,8 @@ PLANTS = [
     Plant(ComOffset(("ankle",)), (0.03, 0.0, -0.03), rivals=("payload",), tested=None),
     Plant(ConstantForce(KNEE), (0.2,), effort=True),
     Plant(EncoderOffset(KNEE), (0.03,), effort=True, tested=None),
+    Plant(EncoderCyclicError(KNEE), (0.015, -0.01, 17.0)),
+    Plant(Cogging(KNEE), (0.25, 0.1, 17.0)),
     Plant(GravityTilt(("robot",)), (0.05, -0.08), rivals=("com_offset",), tested=1),
 ]
 

@@ -52,6 +52,7 @@ from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
 from sysid_btr.terms.sensing import (
+    EncoderCyclicError,
     EncoderOffset,
     EncoderOffsetInLoop,
     EncoderScale,
@@ -206,6 +207,15 @@ def test_cogging_is_a_sine_and_a_cosine_of_the_angle() -> None:
     q = rest(Cogging, [0.15, -0.1, 20.0])
     assert balance(q) == pytest.approx(0, abs=1e-7)
     assert abs(q - solve(lambda q: KP * (COMMAND - q) - gravity(q))) > 1e-3
+
+
+def test_a_cyclic_error_is_in_what_the_log_shows_alone() -> None:
+    log = swing(seconds=1.0)
+    plain = run(pendulum(), log, (), [])
+    seen = run(pendulum(), log, [at_arm(EncoderCyclicError)], [0.02, -0.01, 9.0])
+    q, v = plain.position, plain.velocity
+    np.testing.assert_allclose(seen.position, q + 0.02 * np.sin(9 * q) - 0.01 * np.cos(9 * q), atol=1e-12)
+    np.testing.assert_allclose(seen.velocity, v * (1 + 9 * (0.02 * np.cos(9 * q) + 0.01 * np.sin(9 * q))), atol=1e-12)
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.2), (0.25, 0.0), (-0.1, 0.15)])

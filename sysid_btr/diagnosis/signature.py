@@ -7,7 +7,7 @@ is local in time where a position error is smeared out by the servo.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbance, ExternalDisturbanceTrain
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.sensing import EncoderCyclicError
 from sysid_btr.terms.transmission import Cogging
 
 LOUD = 1.3
@@ -42,6 +43,8 @@ TRAIN_SHARE = 0.15
 LINE_SHARE, LINE_CLEAR = 0.03, 8.0
 """Share of the variance that a spatial frequency must explain, alone and relative to the median one."""
 LINES = 2
+ONCE_AND_TWICE = (1.0, 2.0)
+"""1/rad; an encoder off its centre errs once a turn, one that is bent twice, whatever part of a turn is seen."""
 OWN_RHYTHM = 0.6
 """Share of the velocity that repeats with a period, from which that period is the motion's own."""
 STRETCH, SHORT_STRETCH = 2.5, 0.5
@@ -68,7 +71,8 @@ def proposals(
     residual : (r,) whitened, there.
     library : effects that may be asked for.
     """
-    wanted = {Cogging, ExternalDisturbance, ExternalDisturbanceTrain, DriveDisturbanceTrain} & set(library)
+    pushes = {ExternalDisturbance, ExternalDisturbanceTrain, DriveDisturbanceTrain}
+    wanted = {Cogging, EncoderCyclicError, *pushes} & set(library)
     if not wanted or not np.any(problem.column_chi2(residual) >= LOUD):
         return []
     asked: list[Perturbation] = []
@@ -80,6 +84,9 @@ def proposals(
         scale, place = study.scales[one.joint], (one.joint,)
         if Cogging in wanted:
             asked += [Perturbation(Cogging, place, Cogging.probe_at(scale, x.number)) for x in spatial_lines(one)]
+        if EncoderCyclicError in wanted:
+            numbers = (*ONCE_AND_TWICE, *(x.number for x in spatial_lines(_of_reading(one))))
+            asked += [Perturbation(EncoderCyclicError, place, EncoderCyclicError.probe_at(scale, n)) for n in numbers]
         push = single_pulse(one) if ExternalDisturbance in wanted else None
         # pulses of a train that differ are no pushes that come again: what they follow is something else
         if push is not None and not _within_train(problem, values, one.joint, *push):
@@ -96,6 +103,11 @@ def proposals(
             probe = DriveDisturbanceTrain.probe_at(scale, *when)
             asked.append(Perturbation(DriveDisturbanceTrain, place, probe))
     return asked
+
+
+def _of_reading(one: MissingTorque) -> MissingTorque:
+    """The error of the position in the place of the torque that would explain it."""
+    return replace(one, torque=one.residual, noise=1.0, gain=np.ones_like(one.gain))
 
 
 def _within_train(problem: ReplayProblem, values: FloatArray, joint: str, start: float, duration: float) -> bool:

@@ -33,6 +33,7 @@ from sysid_btr.terms.initial_state import StartPosition, StartVelocity
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
 from sysid_btr.terms.sensing import (
+    EncoderCyclicError,
     EncoderOffset,
     EncoderOffsetInLoop,
     EncoderScale,
@@ -91,6 +92,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     ComOffset,
     ConstantForce,
     Cogging,
+    EncoderCyclicError,
     ExternalDisturbance,
     ExternalDisturbanceTrain,
     DriveDisturbanceTrain,

@@ -1,4 +1,4 @@
-"""What the sensors of a joint show: offset, scale and delay of its encoder, offset and scale of its torque sensor."""
+"""What the sensors of a joint show: errors and delay of its encoder, offset and scale of its torque sensor."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from sysid_btr.interpolation import hermite
 from sysid_btr.terms.base import BatchModel, Fields, Kind, Outputs
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
+from sysid_btr.terms.waves import nearby_waves
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,62 @@ class EncoderScaleInLoop(EncoderScale):
         columns = batch.index.of(self.places)
         qpos[:, columns] /= 1 + values[:, :, 0]
         qvel[:, columns] /= 1 + values[:, :, 0]
+
+
+@dataclass(frozen=True)
+class EncoderCyclicError(Effect):
+    """An encoder whose error repeats with the angle: a magnet or a disc off its centre, a gear on its way.
+
+    Sensor: the log shows q + a sin(n q) + b cos(n q); the servo uses the true q.
+    """
+
+    name: ClassVar[str] = "encoder_cyclic_error"
+    family: ClassVar[str] = "sensor"
+    title: ClassVar[str] = "error of the encoder that repeats with the angle"
+    held: ClassVar[tuple[str, ...]] = ("number",)
+    signed: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("sine", "rad", 0.0, -0.3, 0.3, 0.005),
+        Kind("cosine", "rad", 0.0, -0.3, 0.3, 0.005),
+        Kind("number", "1/rad", 1.0, 0.5, 400.0, 0.05),
+    )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("cogging", "a logged effort, or fast motion"),
+        ("encoder_scale", "motion over a whole period"),
+        ("encoder_offset", "motion over a whole period"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        reach = 0.3 if not scale.slide else 0.3 * scale.span
+        turn = 2 * np.pi / max(scale.span, 1e-9)
+        return (
+            Kind("sine", "rad", 0.0, -reach, reach, reach / 60),
+            Kind("cosine", "rad", 0.0, -reach, reach, reach / 60),
+            Kind("number", "1/rad", 4 * turn, 0.5 * min(turn, 1.0), 200 * turn, 0.05 * turn),
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return ()
+
+    @classmethod
+    def probe_at(cls, scale: JointScale, number: float) -> Probe:
+        """A probe at a spatial frequency that the residual proposes."""
+        size = cls.sized(scale)[0].scale
+        return ((size, 0.0, number), (0.0, size, number))
+
+    @classmethod
+    def initial_guesses(cls, values: FloatArray) -> FloatArray:
+        return nearby_waves(values)
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        columns = batch.index.of(self.places)
+        sine, cosine, number = (values[:, None, :, k] for k in range(3))
+        phase = number * outputs.position[:, :, columns]
+        slope = number * (sine * np.cos(phase) - cosine * np.sin(phase))
+        outputs.position[:, :, columns] += sine * np.sin(phase) + cosine * np.cos(phase)
+        outputs.velocity[:, :, columns] *= 1 + slope
 
 
 @dataclass(frozen=True)

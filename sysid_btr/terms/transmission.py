@@ -11,6 +11,7 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import LINK_SUFFIX, BatchModel, Fields, Kind, Step
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
+from sysid_btr.terms.waves import nearby_waves
 
 if TYPE_CHECKING:
     import mujoco
@@ -185,10 +186,6 @@ class JointComplianceMotor(JointCompliance):
     variant: ClassVar[str] = "motor"
 
 
-PHASES, SIZES, SHIFTS = 8, (1.0, 1.7), (-0.04, -0.02, 0.0, 0.02, 0.04)
-"""From which a refit may begin, relative to what a linear scan says."""
-
-
 @dataclass(frozen=True)
 class Cogging(Effect):
     """A torque that repeats with the joint's angle: motor cogging, an eccentric gear.
@@ -208,6 +205,7 @@ class Cogging(Effect):
         Kind("number", "1/rad", 20.0, 1.0, 400.0, 0.05),
     )
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("encoder_cyclic_error", "a logged effort, or fast motion"),
         ("encoder_scale", "a logged effort"),
         ("joint_spring", "motion over several periods"),
     )
@@ -234,18 +232,7 @@ class Cogging(Effect):
 
     @classmethod
     def initial_guesses(cls, values: FloatArray) -> FloatArray:
-        """Nearby numbers of teeth in all phases: a period off over the range of motion is a minimum of its own."""
-        sine, cosine, number = values
-        size, phase = np.hypot(sine, cosine), np.arctan2(cosine, sine)
-        turns = phase + 2 * np.pi * np.arange(PHASES) / PHASES
-        return np.array(
-            [
-                (size * larger * np.cos(turn), size * larger * np.sin(turn), number * (1 + shift))
-                for larger in SIZES
-                for shift in SHIFTS
-                for turn in turns
-            ]
-        )
+        return nearby_waves(values)
 
     def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
         phase = values[:, :, 2] * step.qpos[:, index]
