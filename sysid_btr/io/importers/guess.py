@@ -122,9 +122,7 @@ def _imu(name: str) -> str | None:
 
 def _joint_column(name: str) -> str | None:
     """``<channel>.<joint>`` that a name stands for, if it says both."""
-    array = re.fullmatch(r"(.+?)\[\s*(\w+)\s*\]", name)
-    if array:
-        name = f"{array[1]}/{array[2]}"
+    name = re.sub(r"\[\s*(\w+)\s*\]", r"/\1/", name)
     parts = [p for p in re.split(r"[/.]", name) if p and p.casefold() not in _PATHS]
     words: list[str] = []
     rest: list[str] = []
@@ -132,8 +130,17 @@ def _joint_column(name: str) -> str | None:
         taken, joint = _strip_words(part)
         words += taken
         rest += [joint] if joint else []
+    if len(rest) > 1:
+        rest = [joint for joint in rest if joint.casefold() not in _PATHS]
     channel = _channel(words)
-    return f"{channel}.{rest[0]}" if channel is not None and len(rest) == 1 else None
+    if channel is None or len(rest) != 1 or (channel != "command" and _speaks_of_commands(rest[0])):
+        return None
+    return f"{channel}.{rest[0]}"
+
+
+def _speaks_of_commands(joint: str) -> bool:
+    """Whether a word for a command stands inside a name: ``motor_cmd_0_q`` is no measurement."""
+    return any(_WORDS.get(word.casefold()) == "command" for word in re.split(r"[_\- ]+", joint))
 
 
 def _strip_words(text: str) -> tuple[list[str], str]:
