@@ -22,6 +22,7 @@ def import_log(
     source: PathLike | Sequence[PathLike] | pd.DataFrame,
     *,
     model: str | Robot | None = None,
+    preset: str | None = None,
     mapping: PathLike | None = None,
     units: Mapping[str, str] | None = None,
     rename: Mapping[str, str] | None = None,
@@ -38,7 +39,8 @@ def import_log(
     source : a file, a folder of a bag or dataset, or several of them, which become episodes of one log; or a
         DataFrame, whose index may be the clock.
     model : built-in name, file, or robot: its joints are matched by name, and their ranges checked.
-    mapping : mapping file (TOML); `sysid_btr.io.importers.mapping` describes it.
+    preset : mapping that comes with the package, as ``--preset``; `sysid_btr.io.importers.presets` has them.
+    mapping : mapping file (TOML), on top of the preset; `sysid_btr.io.importers.mapping` describes it.
     units : channel or column -> unit, as ``--unit``; wins over the mapping.
     rename : joint of the file -> joint of the model, as ``--rename``.
     mount : whether the torso was held or could move.
@@ -61,7 +63,7 @@ def import_log(
     from sysid_btr.io.importers.run import import_log as read
 
     told = with_flags(
-        read_map(None if mapping is None else Path(mapping)),
+        read_map(None if mapping is None else Path(mapping), preset),
         units=list((units or {}).items()),
         renames=list((rename or {}).items()),
         meta={"mount": mount},

@@ -69,6 +69,15 @@ def same(log: Log, expected: Log, columns: Sequence[str], atol: float = 1e-12) -
         ("rad/s", "imu.gyro", 1.0, 1.0),
         ("DEG", "position", 90.0, math.pi / 2),
         (0.001534, "position", 1000.0, 1.534),
+        ("ticks4096", "position", 1024.0, math.pi / 2),
+        ("ticks4096@2048", "command", 1024.0, -math.pi / 2),
+        ("Ticks1000@-250", "position", 250.0, math.pi),
+        ("ticks4096/s", "velocity", 4096.0, 2 * math.pi),
+        ("0.229 rpm", "velocity", 100.0, 22.9 * 2 * math.pi / 60),
+        ("2.69 mA", "current", 10.0, 0.0269),
+        ("0.1V", "voltage", 74.0, 7.4),
+        (".1 %", "duty", 1000.0, 1.0),
+        ("0.1 K", "temperature", 3000.0, 26.85),
     ],
 )
 def test_units_convert(unit: str | float, group: str, value: float, expected: float) -> None:
@@ -85,7 +94,21 @@ def test_every_unit_the_validation_speaks_of_can_be_imported() -> None:
         assert any(u.factor == pytest.approx(factor, rel=1e-12) for u in find(unit)), unit
 
 
-@pytest.mark.parametrize(("unit", "group"), [("deg", "effort"), ("furlong", "position"), ("g", "force")])
+@pytest.mark.parametrize(
+    ("unit", "group"),
+    [
+        ("deg", "effort"),
+        ("furlong", "position"),
+        ("g", "force"),
+        ("ticks4096/s", "position"),
+        ("ticks4096", "velocity"),
+        ("ticks0", "position"),
+        ("ticks", "position"),
+        ("ticks4096@", "position"),
+        ("2 ticks4096", "position"),
+        ("0.229 furlong", "velocity"),
+    ],
+)
 def test_a_unit_that_measures_something_else_is_refused(unit: str, group: str) -> None:
     with pytest.raises(UsageError, match=group):
         resolve(unit, group)
@@ -120,6 +143,15 @@ def test_a_unit_that_measures_something_else_is_refused(unit: str, group: str) -
         ("accel_z", "imu.acc_z"),
         ("imu/roll", "imu.angle_x"),
         ("force.LFoot", "force.LFoot"),
+        ("motorState[0].q", "position.0"),
+        ("motor_state[0].dq", "velocity.0"),
+        ("motorCmd[0].q", "command.0"),
+        ("motor_cmd.0.q", "command.0"),
+        ("motor_cmd", "command.motor"),
+        ("motor_cmd_0_q", None),
+        ("motorCmd[0].dq", None),
+        ("motorCmd[0].tau", None),
+        ("motorCmd[0].Kp", None),
         ("knee", None),
         ("act_1", None),
         ("target_velocity_knee", None),

@@ -29,6 +29,12 @@ class ImportOptions(ModelOptions):
         metavar="NAME",
         decides=False,
     )
+    preset: str | None = option(
+        None, "Mapping that comes with the package; --map and flags go on top of it.", metavar="NAME", decides=False
+    )
+    show_preset: str | None = option(
+        None, "Print a preset, to copy and alter, and do nothing else; `all` lists them.", metavar="NAME", decides=False
+    )
     map: Path | None = option(
         None, "Mapping (TOML): columns, units, joints, topics, metadata.", metavar="FILE", decides=False
     )
@@ -56,6 +62,9 @@ def import_(options: ImportOptions) -> int:
     Every unrecognised column or topic is reported. A table whose columns cannot be guessed gets a mapping file on
     standard output, to fill in. With errors in it the log is not written (exit 3), unless --force is given.
     """
+    if options.show_preset is not None:
+        sys.stdout.write(_preset(options.show_preset))
+        return 0
     from sysid_btr.importing import known_model
     from sysid_btr.io.importers.base import MappingNeeded
     from sysid_btr.io.importers.mapping import read_map, with_flags
@@ -64,7 +73,10 @@ def import_(options: ImportOptions) -> int:
     target = output_file(options.out, options.files, options.overwrite)
     known = known_model(options.model)
     told = with_flags(
-        read_map(options.map), units=options.unit.items(), renames=options.rename.items(), meta={"mount": options.mount}
+        read_map(options.map, options.preset),
+        units=options.unit.items(),
+        renames=options.rename.items(),
+        meta={"mount": options.mount},
     )
     try:
         imported = import_log(options.files, importer=options.format, told=told, model=known)
@@ -85,6 +97,15 @@ def import_(options: ImportOptions) -> int:
     _show(imported, written, options.json)
     _say_what_was_done(imported, target, written)
     return 0 if imported.usable else LogError.exit_code
+
+
+def _preset(name: str) -> str:
+    """The text of a preset; ``all``: a line for each."""
+    from sysid_btr.io.importers.presets import available_presets, preset_text, preset_title
+
+    if name != "all":
+        return preset_text(name)
+    return "".join(f"{known:18} {preset_title(known)}\n" for known in available_presets())
 
 
 def _show(imported: Imported, written: Path | None, as_json: bool) -> None:

@@ -13,8 +13,18 @@ from sysid_btr.errors import LogError
 from sysid_btr.io._clock import typical_interval
 from sysid_btr.io._text import some
 from sysid_btr.io.importers.base import Recording, Signal
+from sysid_btr.io.importers.encoding import decode
 from sysid_btr.io.importers.mapping import ImportMap, JointRule
-from sysid_btr.io.importers.units import NORMALISED, SI, Unit, group_of, is_joint_column, resolve, signed_with_joint
+from sysid_btr.io.importers.units import (
+    NORMALISED,
+    SI,
+    Unit,
+    group_of,
+    is_joint_column,
+    resolve,
+    signed_with_joint,
+    unwrapped,
+)
 from sysid_btr.io.log import Log, LogMeta, closest, is_schema_column
 
 _RESERVED = ("time", "episode")
@@ -27,11 +37,12 @@ _LINEAR = {"command": "m", "position": "m", "velocity": "m/s", "effort": "N"}
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """A column of the schema as it will be written."""
+    """A column of the schema as it will be written; how often its encoder passed the end of a turn."""
 
     values: FloatArray
     unit: str
     stated: bool
+    passed: int = 0
 
 
 def assemble(
@@ -66,7 +77,8 @@ def assemble(
                 problems.append(f"{recording.path}: {signal.source} is a second source of {column}")
                 continue
             try:
-                part[column] = _converted(signal, column, told, (sliding or {}).get(column.partition(".")[2]))
+                slides = (sliding or {}).get(column.partition(".")[2])
+                part[column] = _converted(signal, column, told, slides, recording.episode)
             except LogError as error:
                 problems.append(f"{recording.path}: {error}")
         parts.append(part)
@@ -91,7 +103,7 @@ def assemble(
     )
     if meta.sample_period is None:
         log = replace(log, meta=replace(meta, sample_period=_period(log)))
-    return log, (*remarks, *renamed)
+    return log, (*remarks, *_turns(parts), *renamed)
 
 
 def _unmatched(recordings: Sequence[Recording], told: ImportMap) -> Iterator[str]:
@@ -99,7 +111,7 @@ def _unmatched(recordings: Sequence[Recording], told: ImportMap) -> Iterator[str
     there = dict.fromkeys(
         s.column.partition(".")[2] for r in recordings for s in r.signals if not s.column.startswith("imu.")
     )
-    for name in told.joints:
+    for name in () if told.partial else told.joints:
         if name not in there:
             guess = closest(name, there)
             hint = f"did you mean {guess}? " if guess else ""
@@ -112,7 +124,40 @@ def _renamed(column: str, told: ImportMap) -> str:
     return column if channel == "imu" or rule is None or rule.to is None else f"{channel}.{rule.to}"
 
 
-def _converted(signal: Signal, column: str, told: ImportMap, slides: bool | None) -> _Column:
+def _turns(parts: Sequence[Mapping[str, _Column]]) -> Iterator[str]:
+    """What was done where an encoder passed the end of its turn."""
+    passed = [name for part in parts for name, column in part.items() if column.passed]
+    if passed:
+        yield (
+            f"jumps of more than half a turn are taken for an encoder that passed the end of its turn, and counted on: "
+            f"{some(dict.fromkeys(passed), 8)}; commands are taken as they are"
+        )
+
+
+def _raw(signal: Signal, column: str, told: ImportMap) -> FloatArray:
+    """Values as the source means them: with their sign, NaN where there is none."""
+    values = np.asarray(signal.values, dtype=np.float64)
+    absent = told.absent(column, signal.column)
+    if absent:
+        values = np.where(np.any(np.isclose(values[:, None], absent, rtol=1e-6, atol=0), axis=1), np.nan, values)
+    encoding = told.encoded(column, signal.column)
+    return values if encoding is None else decode(values, encoding)
+
+
+def _continued(values: FloatArray, turn: float, episode: IntArray | None) -> tuple[FloatArray, int]:
+    """Counts of a turn counted on past its end, in each episode; and how often they passed it."""
+    if episode is None:
+        return unwrapped(values, turn)
+    result, passed = values.copy(), 0
+    for number in np.unique(episode):
+        result[episode == number], more = unwrapped(values[episode == number], turn)
+        passed += more
+    return result, passed
+
+
+def _converted(
+    signal: Signal, column: str, told: ImportMap, slides: bool | None, episode: IntArray | None = None
+) -> _Column:
     """Values in the unit of the schema, with the joint's sign and offset; `slides` is None where not known."""
     group = group_of(column)
     source = signal.column.partition(".")[2]
@@ -134,13 +179,16 @@ def _converted(signal: Signal, column: str, told: ImportMap, slides: bool | None
             f"{column} is given in {text}, but the joint {'slides' if slides else 'turns'} in the model: "
             f"give it its own unit by --unit {column}=UNIT"
         )
-    values = unit.convert(np.asarray(signal.values, dtype=np.float64))
+    values, passed = _raw(signal, column, told), 0
+    if unit.turn and group == "position":
+        values, passed = _continued(values, unit.turn, episode)
+    values = unit.convert(values)
     if rule.sign < 0 and signed_with_joint(column):
         values = -values
     if rule.offset and group in ("command", "position") and unit.si in ("rad", "m"):
         values = values + rule.offset
     stated = any(key in told.units for key in (column, signal.column))
-    return _Column(values, unit.si, stated)
+    return _Column(values, unit.si, stated, passed)
 
 
 def _share_of_range(text: str, name: str, rule: JointRule, si: str) -> Unit:

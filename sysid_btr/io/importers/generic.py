@@ -26,6 +26,10 @@ from sysid_btr.io.importers.table import PARQUET, Table, as_seconds, header_name
 from sysid_btr.io.importers.units import SI, Unit, check_key, find, group_of
 from sysid_btr.io.log import IMU_NAMES, LogMeta, closest, is_schema_column
 
+_WILD: Mapping[str, str] = {"*": ".*", "?": r"[\W_]+"}
+_AXES: Mapping[str, str] = {"0": "x", "1": "y", "2": "z"}
+"""Axes of arrays."""
+
 
 @dataclass(frozen=True)
 class TableImporter:
@@ -130,17 +134,16 @@ def _without(table: Table, globs: list[str]) -> Table:
 
 def _as_told(table: Table, told: ImportMap) -> tuple[Guess, list[str]]:
     """Columns as the mapping says, and what in it does not fit the table."""
-    problems = [_no_column(name, table, "[columns]") for name in told.columns if name not in table.columns]
+    absent = [] if told.partial else [name for name in told.columns if name not in table.columns]
+    problems = [_no_column(name, table, "[columns]") for name in absent]
     named = guess(list(table.columns))
     found: dict[str, str] = {}
-    for kind, patterns in told.channels.items():
-        for pattern in patterns:
-            matched = dict(_matches(pattern, kind, table, told))
-            found |= matched
-            if not matched:
-                problems.append(
-                    f"[channels] {kind} = {pattern!r} matches no column; available: {some(table.columns, 12)}"
-                )
+    patterns = [(pattern, kind) for kind, own in told.channels.items() for pattern in own]
+    for pattern, kind in sorted(patterns, key=lambda p: len(p[0])):  # of two that match the longer says more
+        matched = dict(_matches(pattern, kind, table, told))
+        found |= matched
+        if not matched and not told.partial:
+            problems.append(f"[channels] {kind} = {pattern!r} matches no column; available: {some(table.columns, 12)}")
     found |= {name: column for name, column in told.columns.items() if name in table.columns}
     exact = {n: n for n in table.columns if is_schema_column(n) and n not in found}
     found |= {n: c for n, c in exact.items() if c not in found.values()}
@@ -158,17 +161,23 @@ def _as_told(table: Table, told: ImportMap) -> tuple[Guess, list[str]]:
 def _matches(pattern: str, kind: str, table: Table, told: ImportMap) -> list[tuple[str, str]]:
     before, _, rest = pattern.partition("{")
     _, _, after = rest.partition("}")
-    shape = re.compile(re.escape(before) + "(.+)" + re.escape(after))
+    shape = re.compile(f"{_glob(before)}(.+?){_glob(after)}")
     found = []
     for name in table.columns:
         match = shape.fullmatch(name)
         if not match or name in told.columns or name == told.time.column:
             continue
-        column = f"{kind}_{match[1].casefold()}" if kind.startswith("imu.") else f"{kind}.{match[1]}"
+        axis = _AXES.get(match[1], match[1].casefold())
+        column = f"{kind}_{axis}" if kind.startswith("imu.") else f"{kind}.{match[1]}"
         if kind.startswith("imu.") and column.partition(".")[2] not in IMU_NAMES:
             continue
         found.append((name, column))
     return found
+
+
+def _glob(text: str) -> str:
+    """A part of a pattern as a regular expression: ``*`` stands for anything, ``?`` for marks between words."""
+    return "".join(_WILD.get(part, re.escape(part)) for part in re.split(r"([*?])", text))
 
 
 def _no_column(name: str, table: Table, where: str) -> str:

@@ -10,8 +10,17 @@ An example of all its sections:
     position = "deg"
     "position.slider" = "mm"
     "imu.acc" = "g"
+    voltage = "0.1 V"                # a multiple of a unit
+    "position.knee" = "ticks4096@2048"    # counts of an encoder: 4096 a turn, 2048 is the zero
 
-    [channels]                       # where each channel is; {joint}, {axis} or {site} stands for the name
+    [encoding]                       # registers of servos that were read without their sign
+    velocity = "sign15"              # bit 15 is the sign; or int16: two's complement
+
+    [missing]                        # numbers that stand for no value
+    command = [2.146e9]
+
+    [channels]                       # where each channel is; {joint}, {axis} or {site} stands for the name,
+                                     # * for anything, ? for marks between words (_ . / [ ])
     command = "{joint}_cmd"
     position = ["{joint}_pos", "{joint}_angle"]
     "imu.gyro" = "gyro_{axis}"
@@ -29,6 +38,7 @@ An example of all its sections:
     [meta]                           # also: source, notes, command_hold ("zoh", "linear"), servo_period (s)
     robot = "nao"
     mount = "fixed"
+    torque_constant = 0.5            # Nm/A; or by joint: {LKneePitch = 0.5}
 
     [table]                          # of text; what is not said is found out
     missing = ["-9999"]
@@ -48,14 +58,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from sysid_btr.errors import UsageError
+from sysid_btr.io.importers.encoding import EXAMPLES, is_encoding
+from sysid_btr.io.importers.presets import preset_text
 from sysid_btr.io.importers.units import NORMALISED, SI, check_key, group_of, resolve
 from sysid_btr.io.log import is_schema_column
 from sysid_btr.reading import parse_toml
+
+T = TypeVar("T")
 
 
 class _Part(BaseModel):
@@ -133,6 +147,7 @@ class MetaRule(_Part):
     notes: str | None = None
     command_hold: Literal["zoh", "linear"] | None = None
     servo_period: float | None = Field(default=None, gt=0, strict=False)
+    torque_constant: float | dict[str, float] | None = None
 
 
 class RosRule(_Part):
@@ -184,7 +199,10 @@ class ImportMap(_Part):
     ----------
     time, table, ros, lerobot : how to read the source.
     episode : column with the number of the recording that a row belongs to.
+    partial : whether patterns that match no column, columns and joints that are not there are no mistakes.
     units : by kind of column or column; names, or factors to SI.
+    encoding : by kind of column or column; how registers hold their sign, where they were read without it.
+    missing : by kind of column or column; numbers that stand for no value.
     channels : patterns of the source's column names by kind of column.
     columns : the source's columns by name -> column of the schema.
     joints : by the source's name.
@@ -193,8 +211,11 @@ class ImportMap(_Part):
     """
 
     time: TimeRule = TimeRule()
+    partial: bool = False
     episode: str | None = None
     units: dict[str, str | float] = {}
+    encoding: dict[str, str] = {}
+    missing: dict[str, list[float]] = {}
     channels: dict[str, list[str]] = {}
     columns: dict[str, str] = {}
     joints: dict[str, JointRule] = {}
@@ -218,6 +239,31 @@ class ImportMap(_Part):
         if problems:
             raise ValueError("; ".join(problems))
         return units
+
+    @field_validator("encoding")
+    @classmethod
+    def _encodings_exist(cls, encoding: dict[str, str]) -> dict[str, str]:
+        problems = [wrong for key in encoding if (wrong := check_key(key))]
+        problems += [f"{e!r} is not an encoding; use {EXAMPLES}" for e in encoding.values() if not is_encoding(e)]
+        if problems:
+            raise ValueError("; ".join(problems))
+        return encoding
+
+    @field_validator("missing", mode="before")
+    @classmethod
+    def _one_number(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        lists = {k: v if isinstance(v, list) else [v] for k, v in value.items()}
+        return {k: [float(n) if isinstance(n, int) else n for n in v] for k, v in lists.items()}
+
+    @field_validator("missing")
+    @classmethod
+    def _missing_of_columns(cls, missing: dict[str, list[float]]) -> dict[str, list[float]]:
+        problems = [wrong for key in missing if (wrong := check_key(key))]
+        if problems:
+            raise ValueError("; ".join(problems))
+        return missing
 
     @field_validator("channels", mode="before")
     @classmethod
@@ -255,12 +301,25 @@ class ImportMap(_Part):
 
     def unit(self, column: str, *names: str) -> str | float | None:
         """What was said about a column's unit: under its own name (or another of `names`), or its kind's."""
-        return next((self.units[k] for k in (column, *names, group_of(column)) if k in self.units), None)
+        return _said(self.units, column, names)
+
+    def encoded(self, column: str, *names: str) -> str | None:
+        """How a column's register holds its sign, if that was said."""
+        return _said(self.encoding, column, names)
+
+    def absent(self, column: str, *names: str) -> list[float]:
+        """Numbers that stand for no value in a column."""
+        return _said(self.missing, column, names) or []
 
     @property
     def lays_out_columns(self) -> bool:
         """Whether it says which column is what, so that nothing is to be guessed."""
         return bool(self.channels or self.columns)
+
+
+def _said(table: Mapping[str, T], column: str, names: Iterable[str]) -> T | None:
+    """What a table says of a column: under its own name, another of `names`, or its kind's."""
+    return next((table[k] for k in (column, *names, group_of(column)) if k in table), None)
 
 
 def _wrong_unit(key: str, unit: str | float) -> str | None:
@@ -276,23 +335,35 @@ def _wrong_unit(key: str, unit: str | float) -> str | None:
     return None
 
 
-def read_map(path: Path | None) -> ImportMap:
-    """The mapping in a file; an empty one without.
+def read_map(path: Path | None, preset: str | None = None) -> ImportMap:
+    """The mapping in a file, on top of a preset; an empty one without either.
 
     Raises
     ------
     UsageError
-        If it cannot be read, is not TOML, or says something that cannot be; all of it at once.
+        If it cannot be read, is not TOML, or says something that cannot be; all of it at once. If there is no such
+        preset.
     """
+    ground = parse_toml(preset_text(preset).encode()) if preset is not None else {}
     if path is None:
-        return ImportMap()
+        return _checked(ground, f"--preset {preset}")
     try:
         content = parse_toml(path.read_bytes())
     except OSError as error:
         raise UsageError(f"--map {path}: {error.strerror}") from error
     except ValueError as error:
         raise UsageError(f"--map {path} is not TOML: {error}") from error
-    return _checked(content, f"--map {path}")
+    return _checked(_on_top(ground, content), f"--map {path}")
+
+
+def _on_top(ground: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
+    """One mapping over another: entry by entry of their sections."""
+    both = {k: {**ground[k], **content[k]} for k in ground if isinstance(ground[k], dict) and _is_table(content, k)}
+    return {**ground, **content, **both}
+
+
+def _is_table(content: Mapping[str, Any], key: str) -> bool:
+    return isinstance(content.get(key), dict)
 
 
 def with_flags(

@@ -255,5 +255,7 @@ _REMEDIES: Mapping[str, str] = {
     "joint.sign": "reverse the joint's axis in a mapping file ([joints.NAME] sign = -1), or one of its columns "
     '([units] "command.NAME" = -1)',
     "position.range": "correct zero and sign in a mapping file: [joints.NAME] offset = .., sign = -1",
+    "units.counts": "state the counts of a turn and the zero, as in --unit position=ticks4096@2048 "
+    "--unit command=ticks4096@2048, or use a preset (--show-preset all lists them)",
     "joint.swapped": "swap them: --rename LEFT=RIGHT --rename RIGHT=LEFT, if all of their columns are swapped",
 }

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
@@ -18,11 +21,19 @@ NORMALISED: Mapping[str, tuple[float, float]] = {"range_m100_100": (-100.0, 100.
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit: value in `si` = `factor` * value + `shift`."""
+    """A unit: value in `si` = `factor` * value + `shift`.
+
+    Attributes
+    ----------
+    si : unit of the schema.
+    factor, shift : of the conversion.
+    turn : value at which a counter of a turn begins anew, in this unit; 0 for what does not count.
+    """
 
     si: str
     factor: float = 1.0
     shift: float = 0.0
+    turn: float = 0.0
 
     def convert(self, values: FloatArray) -> FloatArray:
         """Values in the unit of the schema; exactly the same ones if they are in it already."""
@@ -93,6 +104,8 @@ _UNITS: Mapping[str, tuple[Unit, ...]] = {
     "1 fraction ratio bool boolean": (Unit("1"),),
     "% percent": (Unit("1", 1e-2),),
 }
+_TICKS = re.compile(r"ticks(?P<turn>[1-9]\d*)(?:@(?P<zero>-?\d+(?:\.\d+)?)|(?P<rate>/s))?", re.I)
+_MULTIPLE = re.compile(r"(?P<number>\d*\.?\d+(?:e-?\d+)?) *(?P<unit>[^\d\s.].*)", re.I)
 _BY_NAME: Mapping[str, tuple[Unit, ...]] = {name: units for names, units in _UNITS.items() for name in names.split()}
 
 
@@ -130,14 +143,25 @@ def resolve(unit: str | float, group: str) -> Unit:
         fitting = [names.split()[0] for names, units in _UNITS.items() if units[0].si in allowed]
         what = f"does not measure {group}" if candidates else "is unknown"
         raise UsageError(
-            f"unit {unit!r} {what}: {group} may be in {', '.join(fitting)}, "
-            f"or give a number, the factor to {allowed[0]}"
+            f"unit {unit!r} {what}: {group} may be in {', '.join(fitting)}{_counts_of(allowed)}, a multiple of these "
+            f"(0.5 {fitting[0]}), or give a number, the factor to {allowed[0]}"
         )
     return chosen
 
 
 def find(text: str) -> tuple[Unit, ...]:
-    """Units of this name, exactly or but for case; none if it is no unit."""
+    """Units of this name, exactly or but for case; none if it is no unit.
+
+    A name may be a multiple of another (``0.229 rpm``), or speak of an encoder's counts: ``ticks4096`` are 4096 a turn,
+    ``ticks4096@2048`` count from the zero at 2048, ``ticks4096/s`` are a speed.
+    """
+    ticks = _TICKS.fullmatch(text.strip())
+    if ticks:
+        return (_ticks(ticks),)
+    multiple = _MULTIPLE.fullmatch(text.strip())
+    if multiple:
+        number = float(multiple["number"])
+        return tuple(replace(u, factor=number * u.factor) for u in find(multiple["unit"]) if not u.turn)
     for mark in (" ", "·", "*", "^"):
         text = text.replace(mark, "")
     text = text.replace(".", "") if not text.replace(".", "").isdigit() else text
@@ -145,6 +169,40 @@ def find(text: str) -> tuple[Unit, ...]:
     if text in _BY_NAME:
         return _BY_NAME[text]
     return next((units for name, units in _BY_NAME.items() if name.casefold() == text.casefold()), ())
+
+
+def _ticks(found: re.Match[str]) -> Unit:
+    """Counts of an encoder."""
+    turn = float(found["turn"])
+    factor = _TURN / turn
+    if found["rate"]:
+        return Unit("rad/s", factor)
+    return Unit("rad", factor, -factor * float(found["zero"] or 0), turn)
+
+
+def _counts_of(allowed: tuple[str, ...]) -> str:
+    return ", ticks4096 (a turn), ticks4096@2048 (its zero)" if "rad" in allowed else ""
+
+
+def unwrapped(values: FloatArray, turn: float) -> tuple[FloatArray, int]:
+    """Counts of a turn that begin anew at its end, counted on; and how often they passed it.
+
+    A step of more than half a turn from one value to the next is taken for the shorter way round. Missing values are
+    passed over.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,).
+    turn : counts in it.
+    """
+    here = np.flatnonzero(np.isfinite(values))
+    steps = np.diff(values[here])
+    passed = -np.round(steps / turn)
+    # half a turn is no shorter the other way
+    passed[np.abs(steps) == turn / 2] = 0
+    result = values.copy()
+    result[here[1:]] += turn * np.cumsum(passed)
+    return result, int(np.count_nonzero(passed))
 
 
 def signed_with_joint(column: str) -> bool:
