@@ -942,30 +942,36 @@ def test_a_trajectory_is_steps_that_the_next_one_replaces(tmp_path: Path, ros: R
     assert "0.1 s before the first command are left out" in text
 
 
+@pytest.mark.parametrize("states", [True, False], ids=["with joint states", "alone"])
+@pytest.mark.parametrize(
+    ("sent_on", "seen", "left"),
+    [("reference", "feedback", ()), ("desired", "actual", ()), ("reference", "feedback", ("desired", "actual"))],
+    ids=["Humble", "Foxy", "both"],
+)
 @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
 def test_a_controllers_own_state_is_the_command_and_its_type_comes_with_the_bag(
-    tmp_path: Path, good: Log, storage: str
+    tmp_path: Path, good: Log, storage: str, sent_on: str, seen: str, left: tuple[str, ...], states: bool
 ) -> None:
+    """ros2_control before and after Humble; fields that are there for old readers only are empty."""
     pytest.importorskip("rosbags", reason="bags need the extra ros")
     from rosbags.typesys import get_types_from_msg
 
     own = Ros()
     kind = "control_msgs/msg/JointTrajectoryControllerState"
     point = "trajectory_msgs/JointTrajectoryPoint"
-    definition = f"std_msgs/Header header\nstring[] joint_names\n{point} reference\n{point} feedback\n"
+    fields = "".join(f"{point} {name}\n" for name in (sent_on, seen, *left))
+    definition = f"std_msgs/Header header\nstring[] joint_names\n{fields}"
     own.store.register(get_types_from_msg(definition, kind))
     sent = []
     for i, t in enumerate(good.time[:100]):
         values = {c: [good.channels[f"{c}.{j}"][i] for j in GOOD_JOINTS] for c in ("command", "position")}
         points = {c: own.trajectory(None, GOOD_JOINTS, [(0.0, v)]).points[0] for c, v in values.items()}
-        state = own(
-            kind,
-            header=own.header(ns(t)),
-            joint_names=list(GOOD_JOINTS),
-            reference=points["command"],
-            feedback=points["position"],
-        )
+        empty = own.trajectory(None, GOOD_JOINTS, [(0.0, [])]).points[0]
+        filled = {sent_on: points["command"], seen: points["position"], **dict.fromkeys(left, empty)}
+        state = own(kind, header=own.header(ns(t)), joint_names=list(GOOD_JOINTS), **filled)
         sent.append(Sent("/controller/state", ns(t), state))
+        if not states:
+            continue
         sent.append(Sent("/joint_states", ns(t), own.joint_state(ns(t), GOOD_JOINTS, values["position"])))
     folder = write_bag(own, tmp_path / "bag", sent, storage)
     for path in (folder, *folder.glob("*.mcap")):

@@ -211,6 +211,63 @@ def test_a_command_of_a_unitree_is_never_taken_for_a_measurement(
     assert all(column.startswith("command.") for column in sent)
 
 
+DEFINITIONS = {
+    "unitree_go/msg/MotorState": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 ddq\nfloat32 tau_est\n",
+    "unitree_go/msg/MotorCmd": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\nfloat32 kp\nfloat32 kd\n",
+    "unitree_go/msg/IMUState": "float32[4] quaternion\nfloat32[3] gyroscope\n"
+    "float32[3] accelerometer\nfloat32[3] rpy\n",
+    "unitree_go/msg/LowState": "IMUState imu_state\nMotorState[20] motor_state\nuint32 tick\n",
+    "unitree_go/msg/LowCmd": "MotorCmd[20] motor_cmd\nuint32 crc\n",
+}
+"""The fields of unitree_go's messages that matter."""
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+def test_a_bag_of_a_unitree_quadruped(tmp_path: Path, storage: str) -> None:
+    pytest.importorskip("rosbags", reason="bags need the extra ros")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for kind, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, kind))
+    types = {kind.rpartition("/")[2]: store.types[kind] for kind in DEFINITIONS}
+    plugin = StoragePlugin[storage]
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        topics = {
+            kind: writer.add_connection(topic, f"unitree_go/msg/{kind}", typestore=store)
+            for topic, kind in (("/lowcmd", "LowCmd"), ("/lowstate", "LowState"))
+        }
+        three = np.zeros(3, dtype=np.float32)
+        for i, t in enumerate(TIME[:200]):
+            there = [(swing(k)[i], rate(k)[i]) if k < 12 else (0.0, 0.0) for k in range(20)]
+            commands = [
+                types["MotorCmd"](mode=1, q=2.146e9 if i < 5 else q + 0.05, dq=dq, tau=0.1, kp=60.0, kd=5.0)
+                for q, dq in there
+            ]
+            states = [types["MotorState"](mode=1, q=q, dq=dq, ddq=0.0, tau_est=1.5) for q, dq in there]
+            turning = np.array([0.1, 0.2, 0.3 + 0.01 * i], dtype=np.float32)
+            imu = types["IMUState"](
+                quaternion=np.zeros(4, dtype=np.float32), gyroscope=turning, accelerometer=9.81 + three, rpy=three
+            )
+            received = 1_700_000_000_000_000_000 + round(t * 1e9)
+            for message in (types["LowCmd"](motor_cmd=commands, crc=0), types["LowState"](imu, states, tick=i)):
+                kind = type(message).__name__.rpartition("__")[2]
+                data = store.serialize_cdr(message, f"unitree_go/msg/{kind}")
+                writer.write(topics[kind], received, data)
+    log = import_log([tmp_path / "bag"], told=read_map(None, "unitree-lowstate")).log
+    assert set(log.joints("position")) == set(log.joints("command")) == set(LEGS)
+    for k, joint in enumerate(LEGS):
+        np.testing.assert_allclose(log.channels[f"position.{joint}"], swing(k)[:200], atol=1e-6)
+        np.testing.assert_allclose(log.channels[f"velocity.{joint}"], rate(k)[:200], atol=1e-6)
+        np.testing.assert_allclose(log.channels[f"effort.{joint}"], 1.5)
+        np.testing.assert_allclose(log.channels[f"command.{joint}"][5:], swing(k)[5:200] + 0.05, atol=1e-6)
+        np.testing.assert_allclose(log.channels[f"command_velocity.{joint}"], rate(k)[:200], atol=1e-6)
+        np.testing.assert_allclose(log.channels[f"command_effort.{joint}"], 0.1, atol=1e-6)
+        assert np.all(np.isnan(log.channels[f"command.{joint}"][:5]))
+    np.testing.assert_allclose(log.channels["imu.gyro_z"], 0.3 + 0.01 * np.arange(200), atol=1e-6)
+
+
 UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 

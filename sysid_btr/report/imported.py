@@ -46,7 +46,7 @@ def summary(imported: Imported) -> Iterator[str]:
     episodes = f" in {parts} episodes" if parts > 1 else ""
     yield f"{len(log)} samples{episodes}, {duration(log):.6g} s, {clock}; torso {log.meta.mount}"
     for channel, names in channels(log).items():
-        yield f"  {channel:12} {', '.join(names)}"
+        yield f"  {channel:16} {', '.join(names)}"
     if log.unknown:
         yield f"  kept as it is: {len(log.unknown)} column{'s' if len(log.unknown) > 1 else ''}"
 

@@ -206,7 +206,7 @@ class ImportMap(_Part):
     channels : patterns of the source's column names by kind of column.
     columns : the source's columns by name -> column of the schema.
     joints : by the source's name.
-    ignore : globs of columns to leave out.
+    ignore : globs of columns to leave out; in bags of columns of the schema, joints by the bag's names.
     meta : metadata.
     """
 

@@ -2,7 +2,8 @@
 
 The rows are the stamps of the measured joint states. Commands are held until the next one; IMU and further joint
 states are interpolated between their own neighbouring samples. What a message holds: common_interfaces
-(sensor_msgs, trajectory_msgs, std_msgs) and ros2_control (control_msgs).
+(sensor_msgs, trajectory_msgs, std_msgs), ros2_control (control_msgs), and unitree_ros2 (unitree_go, unitree_hg), whose
+motors have numbers and no names.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -31,7 +33,10 @@ IMU = "sensor_msgs/Imu"
 TRAJECTORY = "trajectory_msgs/JointTrajectory"
 ARRAYS = ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
 CONTROLLER = "control_msgs/JointTrajectoryControllerState"
-COMMANDS = (JOINT_STATE, TRAJECTORY, CONTROLLER, *ARRAYS)
+MOTOR_STATES = ("unitree_go/LowState", "unitree_hg/LowState")
+MOTOR_COMMANDS = ("unitree_go/LowCmd", "unitree_hg/LowCmd")
+COMMANDS = (JOINT_STATE, TRAJECTORY, CONTROLLER, *MOTOR_COMMANDS, *ARRAYS)
+STATES = (JOINT_STATE, CONTROLLER, *MOTOR_STATES)
 _SCALAR = re.compile(r"std_msgs/(Float(32|64)|U?Int(8|16|32|64)|Bool)")
 _COMMAND_WORDS = re.compile(r"(^|[/_])(commands?|cmds?|desired|target|goal|reference|setpoints?)([/_]|$)")
 _OTHER_QUANTITY = re.compile(r"(^|[/_])(effort|torque|velocity|vel|current)")
@@ -119,6 +124,7 @@ def read_bag(path: Path, bag: Bag, told: ImportMap) -> Recording:
         raise LogError(f"{path}: no message with joint positions on {', '.join(empty)}")
     use_header, remarks = _clock_of(rows, roles, told.ros)
     series, origin, more = _all_series(path, rows, roles, use_header)
+    series = [s for s in series if not any(fnmatchcase(s.column, glob) for glob in told.ignore)]
     meta = LogMeta(extra={"time_origin_ns": origin})
     return _on_one_clock(path, series, roles, meta, (*roles.remarks, *remarks, *more))
 
@@ -131,7 +137,7 @@ def choose_roles(path: Path, topics: Mapping[str, str], rule: RosRule) -> Roles:
     types = {topic: plain_type(kind) for topic, kind in topics.items()}
     absent = [t for t in (*rule.state, *rule.command, *([rule.imu] if rule.imu else [])) if t not in types]
     wrong = [t for t in rule.command if t in types and types[t] not in COMMANDS]
-    wrong += [t for t in rule.state if t in types and types[t] != JOINT_STATE]
+    wrong += [t for t in rule.state if t in types and types[t] not in STATES]
     wrong += [rule.imu] if rule.imu and types.get(rule.imu, IMU) != IMU else []
     if absent or wrong:
         listing = [f"[ros] {t}: not a topic of the bag" for t in absent]
@@ -140,7 +146,9 @@ def choose_roles(path: Path, topics: Mapping[str, str], rule: RosRule) -> Roles:
     command = tuple(rule.command) or tuple(
         t for t, kind in types.items() if _is_command(t, kind) and t not in rule.state
     )
-    state = tuple(rule.state) or tuple(t for t, kind in types.items() if kind == JOINT_STATE and t not in command)
+    measured = tuple(t for t, kind in types.items() if kind in (JOINT_STATE, *MOTOR_STATES) and t not in command)
+    # a controller says what it measures, too
+    state = tuple(rule.state) or measured or tuple(t for t in command if types[t] == CONTROLLER)
     imus = [rule.imu] if rule.imu else [t for t, kind in types.items() if kind == IMU]
     remarks = []
     if len(imus) > 1:
@@ -166,7 +174,7 @@ def choose_roles(path: Path, topics: Mapping[str, str], rule: RosRule) -> Roles:
 
 
 def _is_command(topic: str, kind: str) -> bool:
-    if kind in (TRAJECTORY, CONTROLLER):
+    if kind in (TRAJECTORY, CONTROLLER, *MOTOR_COMMANDS):
         return True
     named = bool(_COMMAND_WORDS.search(topic)) and not _OTHER_QUANTITY.search(topic)
     return named and (kind == JOINT_STATE or kind in ARRAYS)
@@ -211,10 +219,11 @@ def _read(topic: str, kind: str, message: Any, roles: Roles, rule: RosRule) -> I
             values = _by_name("command", message.joint_names, point.positions)
             yield _nanoseconds(point.time_from_start), values
     elif kind == CONTROLLER:
-        # what the controller sends on; called `desired` before ROS 2 Humble
-        points = [getattr(message, n) for n in ("reference", "desired") if hasattr(message, n)]
-        positions = next((p.positions for p in points if len(p.positions)), ())
-        yield 0, _by_name("command", message.joint_names, positions)
+        yield 0, _controller(message, measured=topic in roles.state)
+    elif kind in MOTOR_COMMANDS:
+        yield 0, _motors(message.motor_cmd, {"q": "command", "dq": "command_velocity", "tau": "command_effort"})
+    elif kind in MOTOR_STATES:
+        yield 0, {**_motors(message.motor_state, _MOTOR_STATE), **_motor_imu(message.imu_state)}
     elif kind in ARRAYS and topic in roles.command:
         yield 0, _by_name("command", _order(topic, len(message.data), rule), message.data)
     elif kind == JOINT_STATE and topic in roles.command:
@@ -232,6 +241,42 @@ def _read(topic: str, kind: str, message: Any, roles: Roles, rule: RosRule) -> I
         yield 0, _imu(message)
     else:
         yield 0, {"": float(message.data)}
+
+
+_MOTOR_STATE: Mapping[str, str] = {"q": "position", "dq": "velocity", "tau_est": "effort"}
+
+
+def _motors(motors: Sequence[Any], fields: Mapping[str, str]) -> Values:
+    """Values of motors by their numbers."""
+    return {
+        f"{channel}.{number}": _number(getattr(motor, name))
+        for number, motor in enumerate(motors)
+        for name, channel in fields.items()
+    }
+
+
+def _motor_imu(imu: Any) -> Values:
+    rates = {f"imu.gyro_{axis}": _number(v) for axis, v in zip("xyz", imu.gyroscope, strict=True)}
+    forces = {f"imu.acc_{axis}": _number(v) for axis, v in zip("xyz", imu.accelerometer, strict=True)}
+    angles = {f"imu.angle_{axis}": _number(v) for axis, v in zip("xy", imu.rpy[:2], strict=True)}
+    return {**rates, **forces, **angles}
+
+
+def _controller(message: Any, measured: bool) -> Values:
+    """What a controller sends on, and what it measures; called `desired` and `actual` before ROS 2 Humble."""
+    names = message.joint_names
+    sent, seen = _point(message, "reference", "desired"), _point(message, "feedback", "actual")
+    values = dict(_by_name("command", names, getattr(sent, "positions", ())))
+    if measured and seen is not None:
+        fields = {"position": seen.positions, "velocity": seen.velocities, "effort": seen.effort}
+        values |= {k: v for channel, numbers in fields.items() for k, v in _by_name(channel, names, numbers).items()}
+    return values
+
+
+def _point(message: Any, *names: str) -> Any:
+    """The first of these fields that holds positions; None if none does."""
+    points = (getattr(message, name, None) for name in names)
+    return next((point for point in points if point is not None and len(point.positions)), None)
 
 
 def _by_name(channel: str, names: Sequence[str], values: Sequence[float]) -> Values:
