@@ -485,6 +485,23 @@ def test_built_in_robots_are_written_whole(out: Folder) -> None:
     assert "The log is of a fixed base" in (out.path / "model.xml").read_text()
 
 
+STANDING = """<mujoco><worldbody><body name="trunk" pos="0 0 0.5"><freejoint/><geom size="0.05" mass="2"/>
+<body name="leg"><joint name="hip" axis="0 1 0" damping="0.1" armature="0.01"/>
+<geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.4"/></body></body></worldbody>
+<actuator><position joint="hip" kp="20" kv="1"/></actuator>
+<keyframe><key name="home" qpos="0 0 0.4 1 0 0 0 0.3"/></keyframe></mujoco>"""
+
+
+def test_a_keyframe_of_a_robot_that_was_held_stays_in_the_file(tmp_path: Path, out: Folder) -> None:
+    (tmp_path / "standing.xml").write_text(STANDING)
+    robot = load_robot(str(tmp_path / "standing.xml"))
+    model = model_of(study_of(robot, log=log_of(("hip",))), parse_parameters(["kp:hip"], robot), [0.9])
+    written = save_model(out, draft(model))
+    assert written["reproduces"]
+    after = mujoco.MjModel.from_xml_path(str(out.path / "model.xml"))
+    np.testing.assert_array_equal(after.key("home").qpos, [0, 0, 0.4, 1, 0, 0, 0, 0.3])
+
+
 URDF = """<robot name="arm"><mujoco><compiler strippath="false" discardvisual="false"/></mujoco>
 <link name="base"/>
 <link name="upper"><inertial><origin xyz="0.0123456789012 0 -0.1"/><mass value="0.3123456789012"/>

@@ -101,6 +101,8 @@ def load_model(path: Path, *, held: bool) -> mujoco.MjModel:
             if joint.type == mujoco.mjtJoint.mjJNT_FREE:
                 joint.parent.pos = np.add(joint.parent.pos, (0.0, 0.0, LIFT))
                 spec.delete(joint)
+        for key in list(spec.keys):  # of the robot with its free joint
+            spec.delete(key)
         return spec.compile()
 
 
