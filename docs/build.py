@@ -31,10 +31,12 @@ from sysid_btr.terms.library import effects
 HERE = Path(__file__).parent
 TITLES = {
     "index": "Overview",
+    "first_hour": "The first hour",
     "robot_and_log": "Your robot and your log",
     "verdicts": "What each verdict means",
     "reports": "The reports",
     "effects": "Effects",
+    "servos": "Identified servos",
     "result": "result.json",
     "machines": "Many machines",
     "limits": "Limits",
