@@ -18,6 +18,7 @@ import sysid_btr as sb
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.io.importers import import_log
+from sysid_btr.io.importers.base import MappingNeeded
 from sysid_btr.io.importers.encoding import decode
 from sysid_btr.io.importers.mapping import ImportMap, read_map
 from sysid_btr.io.importers.presets import available_presets, preset_text, preset_title
@@ -427,6 +428,15 @@ def test_a_preset_can_be_shown_and_used_from_python(cli: Cli, tmp_path: Path) ->
     table = dynamixel(NAMES["register_1"], True)
     log = sb.import_log(pd.DataFrame(table), preset="dynamixel-x", rename={"1": "hip"}).log
     np.testing.assert_allclose(log.channels["position.hip"], swing(0), atol=math.pi / 4096)
+
+
+def test_a_table_that_a_preset_knows_is_told_so(tmp_path: Path) -> None:
+    pd.DataFrame(unitree(STYLES["underscores"])).to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(MappingNeeded, match="--preset unitree-lowstate knows columns of such names"):
+        import_log([tmp_path / "log.csv"])
+    pd.DataFrame({"a": TIME, "b": TIME}).to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(MappingNeeded, match=r"hold positions\. A mapping"):
+        import_log([tmp_path / "log.csv"])
 
 
 def test_counts_without_a_unit_are_told_with_the_way_out(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ from sysid_btr.io._file import TEXT, UNKNOWN, looks_like
 from sysid_btr.io._text import some
 from sysid_btr.io.importers.base import MappingNeeded, Recording, Signal
 from sysid_btr.io.importers.guess import Guess, guess, proposal
-from sysid_btr.io.importers.mapping import ImportMap
+from sysid_btr.io.importers.mapping import ImportMap, read_map
+from sysid_btr.io.importers.presets import available_presets
 from sysid_btr.io.importers.table import PARQUET, Table, as_seconds, header_names, read_table
 from sysid_btr.io.importers.units import SI, Unit, check_key, find, group_of
 from sysid_btr.io.log import IMU_NAMES, LogMeta, closest, is_schema_column
@@ -207,9 +208,17 @@ def _needed(path: Path, table: Table, found: Guess, time: str | None) -> Mapping
         missing.append("which column holds the time")
     missing += [f"which columns hold {c}s" for c in ("command", "position") if not found.joints(c)]
     said = " and ".join(missing)
+    fitting = [name for name in available_presets() if _fits(table, read_map(None, name))]
+    preset = f"--preset {' or --preset '.join(fitting)} knows columns of such names. Else: a" if fitting else "A"
     return MappingNeeded(
-        f"{path}: the names of its {len(table.columns)} columns do not reveal {said}. A mapping file to fill in "
+        f"{path}: the names of its {len(table.columns)} columns do not reveal {said}. {preset} mapping file to fill in "
         "is on standard output: save it (sysid-btr import FILE > mapping.toml), edit it, "
         "and give it by --map mapping.toml",
         partial(proposal, path, table, found),
     )
+
+
+def _fits(table: Table, told: ImportMap) -> bool:
+    """Whether a mapping finds commands and positions in a table."""
+    found, _ = _as_told(_without(table, told.ignore), told)
+    return bool(found.joints("command") and found.joints("position"))
