@@ -305,6 +305,15 @@ def test_ur_rtde(tmp_path: Path, torque: bool) -> None:
     assert log.meta.torque_constant == {f"{name}_joint": 10 + i for i, name in enumerate(UR)}
 
 
+def test_joints_that_are_not_in_the_table_are_told(tmp_path: Path) -> None:
+    """No error: a preset names more joints than many a table has."""
+    table = {"timestamp": TIME} | {f"{c}_q_{i}": swing(i) for i in range(3) for c in ("target", "actual")}
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    imported = import_log([tmp_path / "log.csv"], told=read_map(None, "ur-rtde"))
+    assert set(imported.log.joints("position")) == {"shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"}
+    assert [text[:11] for text in imported.remarks if "no such name" in text] == [f"[joints] {i}:" for i in (3, 4, 5)]
+
+
 # --- counts of a turn ---------------------------------------------------------------------------------------------
 
 

@@ -67,7 +67,8 @@ def assemble(
         If a joint that is to be renamed is not there, two columns end up as one, or a joint that slides is in
         degrees; all problems at once.
     """
-    problems = list(_unmatched(recordings, told))
+    unmatched = list(_unmatched(recordings, told))
+    problems = [] if told.partial else [f"--rename or [joints] {said}" for said in unmatched]
     parts: list[dict[str, _Column]] = []
     for recording in recordings:
         part: dict[str, _Column] = {}
@@ -103,7 +104,8 @@ def assemble(
     )
     if meta.sample_period is None:
         log = replace(log, meta=replace(meta, sample_period=_period(log)))
-    return log, (*remarks, *_turns(parts), *renamed)
+    unused = [f"[joints] {said}" for said in unmatched]
+    return log, (*remarks, *_turns(parts), *renamed, *unused)
 
 
 def _unmatched(recordings: Sequence[Recording], told: ImportMap) -> Iterator[str]:
@@ -111,11 +113,11 @@ def _unmatched(recordings: Sequence[Recording], told: ImportMap) -> Iterator[str
     there = dict.fromkeys(
         s.column.partition(".")[2] for r in recordings for s in r.signals if not s.column.startswith("imu.")
     )
-    for name in () if told.partial else told.joints:
+    for name in told.joints:
         if name not in there:
             guess = closest(name, there)
             hint = f"did you mean {guess}? " if guess else ""
-            yield f"--rename or [joints] {name}: no such name; {hint}available: {some(there, 30)}"
+            yield f"{name}: no such name; {hint}available: {some(there, 30)}"
 
 
 def _renamed(column: str, told: ImportMap) -> str:
