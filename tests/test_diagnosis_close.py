@@ -17,7 +17,7 @@ from sysid_btr.diagnosis.closing import Closing, NamedEffect
 from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
-from sysid_btr.diagnosis.scan import Perturbation, Sensitivity, where_something_is
+from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, where_something_is
 from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
 from sysid_btr.diagnosis.state import State
@@ -475,8 +475,9 @@ def test_costly_questions_are_asked_only_where_a_simple_effect_explains_somethin
         return Perturbation(effect, places, ((1.0,),))
 
     def sensitivity(place: str, gain: float) -> Sensitivity:
-        nothing = np.zeros(0)
-        return Sensitivity(at(CoulombFriction, place), nothing.astype(np.int64), nothing, nothing, gain, nothing)
+        nothing, residual = np.zeros(0), Residual.of(np.zeros(1), np.zeros((1, 0)))
+        rows = nothing.astype(np.int64)
+        return Sensitivity(at(CoulombFriction, place), residual, rows, nothing, nothing, gain, nothing)
 
     plain = [at(CoulombFriction, p) for p in ("hip", "knee", "ankle")]
     costly = [at(Backlash, p) for p in ("hip", "knee", "ankle", "toe")] + [at(Backlash, "ankle", "hip")]

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, NamedEffect
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
-from sysid_btr.diagnosis.scan import Perturbation, Sensitivity
+from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity
 from sysid_btr.diagnosis.selection import (
     Selection,
     agree,
@@ -523,6 +525,30 @@ def test_candidates_are_listed_best_first_with_those_that_did_as_well() -> None:
     assert all(c.confused_with == () for c in worse), "what makes it worse is confused with nothing"
 
 
+# --- what is to be explained ------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1), st.sets(st.integers(0, 4)), st.sampled_from([0.0, 1e-3, 1.0]))
+def test_a_residual_beside_some_of_the_parameters_is_what_they_alone_leave(
+    seed: int, gone: set[int], apart: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    jacobian, response = rng.normal(size=(40, 5)) * np.logspace(0, 6, 5), rng.normal(size=(40, 2))
+    jacobian[:, 1] = jacobian[:, 0] + apart * jacobian[:, 1]
+    residual, other = rng.normal(size=(2, 40))
+    kept = np.delete(jacobian, sorted(gone), axis=1)
+    whole, alone = Residual.of(residual, jacobian), Residual.of(other, kept)
+    beside = whole.beside(other, kept)
+    assert np.allclose(beside.rest, alone.rest, atol=1e-6)
+    rows = np.arange(40)
+    perturbation = Perturbation(CoulombFriction, ("knee",), ((1.0,), (2.0,)))
+    explained = [
+        Sensitivity(perturbation, r, rows, response, np.ones(2), 1.0, np.ones(1)).explained for r in (beside, alone)
+    ]
+    assert np.allclose(*explained, atol=1e-6)
+    assert np.allclose(kept.T @ explained[0], 0.0, atol=1e-5 * np.linalg.norm(kept, axis=0).max(initial=1.0))
+
+
 # --- hypotheses -----------------------------------------------------------------------------------------------------
 
 
@@ -535,7 +561,8 @@ def sensitivity(
     values[effect.main] = amount
     response = np.array(direction, dtype=np.float64)[:, None]
     perturbation = Perturbation(effect, places, ((amount,),))
-    return Sensitivity(perturbation, np.arange(len(response)), response, np.ones(1), gain, values)
+    nothing = Residual.of(np.zeros(len(response)), np.zeros((len(response), 0)))
+    return Sensitivity(perturbation, nothing, np.arange(len(response)), response, np.ones(1), gain, values)
 
 
 HIP, KNEE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)

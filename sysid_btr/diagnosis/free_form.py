@@ -15,6 +15,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.signal_features import FOLDS, line_shares, memory
+from sysid_btr.identify.intervals import NORMAL
 from sysid_btr.identify.missing_torque import MissingTorque
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.drives import DriveKind
@@ -189,7 +190,7 @@ def _form(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale, 
     x = np.linspace(0.0, 1.0, 101) if more else np.linspace(*ends, 101)
     modes = effect.modes_at(x, *ends)
     line = modes @ curve.amounts
-    half = 1.96 * np.sqrt(np.einsum("nk,kl,nl->n", modes, curve.covariance, modes))
+    half = NORMAL * np.sqrt(np.einsum("nk,kl,nl->n", modes, curve.covariance, modes))
     hypothesis = Hypothesis(effect, (joint,), False, start, share * float(sum(weights)))
     term = effect.at((joint,), {joint: scale})
     noun, _, rest = effect.title.partition(" that ")

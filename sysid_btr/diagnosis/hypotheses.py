@@ -166,7 +166,7 @@ def _grow(
 def _unit(one: Sensitivity, residuals: int, basis: FloatArray | None) -> FloatArray | None:
     """What it explains of the residual as a unit vector, less what a basis spans; (residuals, 1)."""
     full = np.zeros(residuals)
-    full[one.rows] = one.response @ one.amounts
+    full[one.rows] = one.explained
     norm = float(np.linalg.norm(full))
     if norm == 0:
         return None

@@ -75,7 +75,7 @@ def replacements(state: State, library: Library, parts: Sequence[IntArray], rule
     whole, without = Residual.of(residual, jacobian), []
     for part in parts:
         gone = jacobian[:, part] @ (model.terms.nominal[part] - model.values[part])
-        without.append(Residual.of(residual + gone, np.delete(jacobian, part, axis=1)))
+        without.append(whole.beside(residual + gone, np.delete(jacobian, part, axis=1)))
     found = responding(problem.with_numerics(study.cheap), model.values, without, asked, study.scales, rules)
     result = []
     for own, rest in zip(found, without, strict=True):

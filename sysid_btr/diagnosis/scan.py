@@ -7,7 +7,7 @@ can do, is compared with the residual. Subtrees that move independently are scan
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,50 +42,68 @@ class Perturbation:
 
 
 @dataclass(frozen=True, eq=False)
-class Sensitivity:
-    """How the residual responds to a perturbation.
-
-    Attributes
-    ----------
-    perturbation : what was simulated.
-    rows : (n,) residuals that can respond.
-    response : (n, directions) change of the whitened residual, projected off the declared parameters.
-    amounts : (directions,) legal multiples that explain most of the residual.
-    gain : decrease of the sum of squared residuals.
-    values : (kinds,) the effect they stand for.
-    """
-
-    perturbation: Perturbation
-    rows: IntArray
-    response: FloatArray
-    amounts: FloatArray
-    gain: float
-    values: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Residual:
-    """What is to be explained, beside what the parameters can do.
+    """What is to be explained, beside what some parameters can do.
 
     Attributes
     ----------
-    basis : (r, k) orthonormal, of what the parameters can do.
+    basis : (r, k) orthonormal; one array for all residuals that are looked at together.
+    within : (k, j) orthonormal, in coordinates of `basis`: what the parameters can do.
     rest : (r,) the residual off it.
     """
 
     basis: FloatArray
+    within: FloatArray
     rest: FloatArray
 
     @classmethod
     def of(cls, residual: FloatArray, jacobian: FloatArray) -> Residual:
         """A residual (r,) beside parameters with these derivatives (r, p)."""
         basis = _orthonormal(jacobian)
-        return cls(basis, residual - basis @ (basis.T @ residual))
+        return cls(basis, np.eye(basis.shape[1]), residual - basis @ (basis.T @ residual))
+
+    def beside(self, residual: FloatArray, jacobian: FloatArray) -> Residual:
+        """Another residual (r,), beside some of the same parameters with these derivatives (r, q)."""
+        within = _orthonormal(self.basis.T @ jacobian)
+        return replace(
+            self, within=within, rest=residual - self.basis @ (within @ (within.T @ (self.basis.T @ residual)))
+        )
 
     @property
     def least(self) -> float:
         """Squared response below which a log cannot show an effect."""
         return NO_RESPONSE * float(self.rest @ self.rest) / len(self.rest)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """How a residual responds to a perturbation.
+
+    Attributes
+    ----------
+    perturbation : what was simulated.
+    residual : what is to be explained.
+    rows : (n,) of it that can respond.
+    response : (n, directions) change of the whitened residual; one array for all residuals.
+    amounts : (directions,) legal multiples that explain most of the residual.
+    gain : decrease of the sum of squared residuals.
+    values : (kinds,) the effect they stand for.
+    """
+
+    perturbation: Perturbation
+    residual: Residual
+    rows: IntArray
+    response: FloatArray
+    amounts: FloatArray
+    gain: float
+    values: FloatArray
+
+    @property
+    def explained(self) -> FloatArray:
+        """What the multiples change, (n,), projected off what the parameters can do."""
+        change, within = self.response @ self.amounts, self.residual.within
+        basis = self.residual.basis[self.rows]
+        return np.asarray(change - basis @ (within @ (within.T @ (basis.T @ change))))
 
 
 def perturbations(
@@ -145,7 +163,8 @@ def responding(
 ) -> list[list[Sensitivity]]:
     """The same for several residuals, (r,) each, beside different parameters: every perturbation is simulated once.
 
-    What it does is simulated in the model of `problem` at `values`; what it explains is judged for each residual.
+    What it does is simulated in the model of `problem` at `values`; what it explains is judged for each residual. All
+    have one `basis`.
     """
     plain = [q for q in asked if not _costly(q)]
     found = _simulate(problem, values, residuals, plain, scales) if plain else [[] for _ in residuals]
@@ -266,47 +285,36 @@ def _simulate(
                 rows = rows_of.get(_subtree(asked[i], where), everywhere)
                 finite = np.isfinite(change).all()
                 responses[i, d] = change[rows] if finite else None
-    judged: list[list[Sensitivity]] = []
-    for residual in residuals:
-        parts = {subtree: _Part.of(residual, rows) for subtree, rows in rows_of.items()}
-        whole = _Part.of(residual, everywhere)
-        found = []
-        for i, perturbation in enumerate(asked):
-            seen = [responses[i, d] for d in range(len(perturbation.probe))]
-            known = [c for c in seen if c is not None]
-            if len(known) < len(seen):
-                continue
-            part = parts.get(_subtree(perturbation, where), whole)
-            answer = _judge(perturbation, part, np.column_stack(known), residual.least, scales)
+    bases = {subtree: residuals[0].basis[rows] for subtree, rows in rows_of.items()}
+    judged: list[list[Sensitivity]] = [[] for _ in residuals]
+    for i, perturbation in enumerate(asked):
+        known = [c for d in range(len(perturbation.probe)) if (c := responses.pop((i, d))) is not None]
+        if len(known) < len(perturbation.probe):
+            continue
+        subtree, response = _subtree(perturbation, where), np.column_stack(known)
+        rows = rows_of.get(subtree, everywhere)
+        coordinates = bases.get(subtree, residuals[0].basis).T @ response
+        for own, residual in zip(judged, residuals, strict=True):
+            answer = _judge(perturbation, residual, rows, response, coordinates, scales)
             if answer is not None:
-                found.append(answer)
-        judged.append(found)
+                own.append(answer)
     return judged
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """The residuals of a subtree, or all: their rows (n,), the basis there (n, k), and what is to be explained (n,)."""
-
-    rows: IntArray
-    basis: FloatArray
-    rest: FloatArray
-
-    @classmethod
-    def of(cls, residual: Residual, rows: IntArray) -> _Part:
-        return cls(rows, residual.basis[rows], residual.rest[rows])
-
-
 def _judge(
-    perturbation: Perturbation, part: _Part, response: FloatArray, least: float, scales: Scales
+    perturbation: Perturbation,
+    residual: Residual,
+    rows: IntArray,
+    response: FloatArray,
+    coordinates: FloatArray,
+    scales: Scales,
 ) -> Sensitivity | None:
-    """How much of the residual legal multiples of a response explain; None of one below `least`, squared."""
-    coefficients = part.basis.T @ response
-    projected = response - part.basis @ coefficients
+    """How much of a residual legal multiples of a response explain, which has these coordinates (k, directions)."""
+    coefficients = residual.within.T @ coordinates
     gram = response.T @ response - coefficients.T @ coefficients
     # the residual is off the basis, so what the projection takes, here and from other subtrees, has no part in this
-    inner = response.T @ part.rest
-    if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= least:
+    inner = response.T @ residual.rest[rows]
+    if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= residual.least:
         return None
     # the residual is measured minus predicted, so a response that explains it has the opposite sign
     amounts = _legal(perturbation.effect, gram, -inner)
@@ -314,7 +322,7 @@ def _judge(
     values = perturbation.effect.combine(scale_at(scales, perturbation.place), perturbation.probe, amounts)
     if values is None or gain <= 0:
         return None
-    return Sensitivity(perturbation, part.rows, projected, amounts, gain, values)
+    return Sensitivity(perturbation, residual, rows, response, amounts, gain, values)
 
 
 def _legal(effect: type[Effect], gram: FloatArray, target: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.identify.intervals import Estimate, correlation_matrix
+from sysid_btr.identify.intervals import NORMAL, Estimate, correlation_matrix
 from sysid_btr.terms.free_form import FreeCurve
 from sysid_btr.terms.model import Model
 
@@ -73,7 +73,7 @@ def curves_of(model: Model, estimates: Sequence[Estimate]) -> tuple[Curve, ...]:
             free = [(at[name], kind) for name, kind in pairs if name in at and kind < modes.shape[1]]
             rows, columns = [row for row, _ in free], [kind for _, kind in free]
             known, seen = covariance[np.ix_(rows, rows)], modes[:, columns]
-            half = 1.96 * np.sqrt(np.maximum(np.einsum("nk,kl,nl->n", seen, known, seen), 0.0))
+            half = NORMAL * np.sqrt(np.maximum(np.einsum("nk,kl,nl->n", seen, known, seen), 0.0))
             variable, amount = term.axes
             found.append(
                 Curve(

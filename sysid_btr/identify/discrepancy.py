@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.identify.intervals import Estimate, correlations
+from sysid_btr.identify.intervals import NORMAL, Estimate, correlations
 from sysid_btr.identify.missing_torque import (
     MissingTorque,
     TorqueResponse,
@@ -105,8 +105,6 @@ def features(one: MissingTorque) -> FloatArray:
 
 FEATURES = 8
 """Of them."""
-NORMAL = 1.96
-"""Standard errors that half a 95 % interval has."""
 
 
 def _size(ones: Sequence[MissingTorque]) -> float:

@@ -16,11 +16,9 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Problem
-from sysid_btr.identify.intervals import Estimate, responses
+from sysid_btr.identify.intervals import NORMAL, Estimate, responses
 from sysid_btr.terms.base import Parameter
 
-NORMAL = 1.96
-"""Standard errors that half a 95 % interval has."""
 NEARLY = 0.9
 """Of the loss that a parabola promises at an end, what is taken for it: the end would move by five percent."""
 AMONG_OTHERS = 2.0

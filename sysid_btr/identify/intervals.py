@@ -16,6 +16,8 @@ from sysid_btr.objectives.covariance import RANK, Known, spread
 from sysid_btr.terms.base import Parameter
 
 Identifiable = Literal["yes", "weak", "no"]
+NORMAL = 1.96
+"""Standard errors that half a 95 % interval has."""
 NOT_IDENTIFIABLE = 0.15
 """Standard error, as a fraction of the range of the bounds, beyond which a log says nothing."""
 CONFOUNDED = 0.5

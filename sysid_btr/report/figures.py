@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.identify.intervals import NORMAL
 from sysid_btr.report.style import FOUND, SHADE, faint, ink, model_colours, new_figure
 from sysid_btr.report.traces import Trace
 from sysid_btr.units import si_all
@@ -54,8 +55,6 @@ def plot_overlay(traces: Sequence[Trace], figure: Figure | None = None) -> Any:
 
 LAGS = 1.0
 """s over which residuals are correlated."""
-BAND = 1.96
-"""Standard deviations of a 95 % band."""
 
 
 def plot_residuals(traces: Sequence[Trace], figure: Figure | None = None) -> Any:
@@ -114,7 +113,7 @@ def correlate(late: FloatArray, early: FloatArray, lags: int) -> tuple[FloatArra
     size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
     found = np.array([np.dot(a[k:], b[: len(b) - k]) for k in range(lags + 1)]) / max(size, 1e-300)
     count = int(np.sum(np.isfinite(late) & np.isfinite(early)))
-    return found, BAND / np.sqrt(max(count, 1))
+    return found, NORMAL / np.sqrt(max(count, 1))
 
 
 def plot_convergence(fit: Fit, axes: Axes | None = None) -> Axes:
