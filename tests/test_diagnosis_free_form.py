@@ -19,6 +19,7 @@ from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.free_form import (
     FreeFrictionLoad,
     FreeFrictionPosition,
+    FreeGainTime,
     FreeTorqueLoad,
     FreeTorquePeriodic,
     FreeTorquePosition,
@@ -111,6 +112,7 @@ CASES = {
     FreeFrictionPosition: lambda m: -np.sign(m.velocity) * 0.2 * (1 + np.sin(5 * m.position)),
     FreeTorquePosition: lambda m: -1.5 * m.position**3,
     FreeTorqueTime: lambda m: 0.3 / (1 + np.exp(-(m.time - 6.0))),
+    FreeGainTime: lambda m: m.servo * (0.15 - 0.3 / (1 + np.exp(-(m.time - 6.0)))),
 }
 
 
@@ -158,3 +160,21 @@ def test_a_wave_that_the_model_lacks_is_found_in_a_log_and_a_refit_leaves_the_no
     done = attempt(study, Model.of(()), found[0].hypothesis, STANDARD).fitted
     assert done.holdout < 1.3
     assert done.model.values[-1] == pytest.approx(3.7, abs=2e-3)
+
+
+def test_a_gain_that_falls_and_recovers_is_found_in_a_log_and_a_refit_leaves_the_noise() -> None:
+    """Not in the form of the term: the gain drops at once, and comes back."""
+    term = FreeGainTime.at(("RKnee",), STUDY.scales)
+    x = np.linspace(0.0, STUDY.scales["RKnee"].seconds, 200)
+    change = -0.25 * np.exp(-(((x - 3.0) / 1.2) ** 2))
+    amounts = np.linalg.lstsq(term.modes_of("RKnee", x), change - change.mean(), rcond=None)[0]
+    study = study_of(Model.of([term], amounts))
+    problem = study.train_problem(())
+    found = free_forms(problem, np.zeros(0), study.scales, missing_torques(problem, np.zeros(0), study.scales))
+    assert found[0].hypothesis.effect is FreeGainTime
+    assert "a change of gain at RKnee that follows time: from" in found[0].sentence
+    done = attempt(study, Model.of(()), found[0].hypothesis, STANDARD).fitted
+    assert done.holdout < 1.3
+    moving = x[x > 1.0]  # a gain does nothing at a joint at rest
+    found_there, there = (term.curve("RKnee", v, moving) for v in (done.model.values, amounts))
+    np.testing.assert_allclose(found_there, there, atol=0.02)

@@ -25,6 +25,7 @@ from sysid_btr.terms.free_form import (
     FREE_FORMS,
     FreeCurve,
     FreeFrictionSpeed,
+    FreeGainTime,
     FreeReadingPosition,
     FreeTorqueLoad,
     FreeTorquePeriodic,
@@ -38,6 +39,7 @@ from sysid_btr.terms.free_form import (
 )
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.power import VoltageSag
 from sysid_btr.terms.sensing import EncoderScale
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.writeback.params import read_params
@@ -116,6 +118,25 @@ def test_a_straight_error_of_the_encoder_is_one_of_its_scale() -> None:
 def test_level_friction_that_does_not_depend_on_speed_is_dry_friction() -> None:
     dry = moved(CoulombFriction.at(("knee",), STUDY.scales), [0.2])
     np.testing.assert_allclose(moved(at_knee(FreeFrictionSpeed), [0.2, *[0.0] * 7]), dry, atol=1e-5)
+
+
+def test_a_gain_that_falls_evenly_is_a_supply_that_sags() -> None:
+    term, rate = at_knee(FreeGainTime), 0.05
+    x = np.linspace(*term.ranges[0], 50)
+    middle = 1.0 - rate * float(np.mean(term.ranges[0]))
+    weaker = robot_from_xml(XML.replace('kp="20" kv=".5"', f'kp="{20 * middle}" kv="{0.5 * middle}"'))
+    amounts = fitted(term, x, (1.0 - rate * x) / middle - 1.0)
+    within = LOG.time <= term.ranges[0][1]
+    sagging, plain = moved(VoltageSag.at(("robot",), STUDY.scales), [rate])[within], moved(term, term.neutral)[within]
+    falling = Replay(weaker, LOG, (term,), STUDY.numerics).predict(amounts[None]).position[0, :, 0][within]
+    assert np.abs(falling - sagging).max() < 0.01 * np.abs(plain - sagging).max()
+
+
+def test_a_gain_never_changes_its_sign() -> None:
+    term = at_knee(FreeGainTime)
+    most = np.array([p.upper for p in term.parameters])
+    assert np.isfinite(moved(term, most)).all()
+    assert np.isfinite(moved(term, -most)).all()
 
 
 def test_friction_never_drives() -> None:

@@ -26,6 +26,7 @@ from sysid_btr.terms.free_form import (
     FreeFrictionLoad,
     FreeFrictionPosition,
     FreeFrictionSpeed,
+    FreeGainTime,
     FreeReadingPosition,
     FreeTorqueCommand,
     FreeTorqueLoad,
@@ -68,10 +69,16 @@ VARIABLES: Mapping[type[FreeCurve], Callable[[MissingTorque], FloatArray]] = {
     FreeTorqueCommand: lambda m: m.command,
     FreeTorqueTime: lambda m: m.time,
     FreeTorquePeriodic: lambda m: m.time,
+    FreeGainTime: lambda m: m.time,
 }
 """What each form is a function of, as estimated beside the missing torque. Friction follows what the drive really
 gave; a torque must not, because a drive answers every disturbance."""
-OF_TIME = (FreeTorqueTime, FreeTorquePeriodic)
+PER_UNIT: Mapping[type[FreeCurve], Callable[[MissingTorque], FloatArray]] = {
+    FreeFriction: lambda m: -m.direction,
+    FreeGainTime: lambda m: m.servo_measured,
+}
+"""Torque for a curve of 1, of those that are no torques themselves."""
+OF_TIME = (FreeTorqueTime, FreeTorquePeriodic, FreeGainTime)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +164,7 @@ def _forms(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale)
         yield _form(effect, own, scale, ())
     elif len(own) > 1:
         return  # the clocks of several logs have nothing to do with each other
-    elif effect is FreeTorqueTime:
+    elif effect is not FreeTorquePeriodic:
         yield _form(effect, own, scale, ())
     else:
         lines = [_form(effect, own, scale, (f,)) for f in frequencies(own[0].one)]
@@ -204,9 +211,8 @@ def design(
     """(n, modes) torques of a form's modes along an estimate, each of rms 1 over its range."""
     x = VARIABLES[effect](one)
     modes = effect.modes_at(x * frequency if effect is FreeTorquePeriodic else x, *ends)
-    if not issubclass(effect, FreeFriction):
-        return modes
-    return np.asarray(-one.direction[:, None] * modes)
+    acts = next((torque for base, torque in PER_UNIT.items() if issubclass(effect, base)), None)
+    return modes if acts is None else np.asarray(acts(one)[:, None] * modes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,8 +231,8 @@ def _penalised(torque: FloatArray, seen: FloatArray, relative: FloatArray) -> _C
     The residual is correlated: its independent samples are fewer by its memory.
     """
     gram, inner = seen.T @ seen, seen.T @ torque
-    size = float(np.mean(torque**2))
-    noise = max(size, 1e-300)
+    noise = max(float(np.mean(torque**2)), 1e-300)
+    size = noise / max(float(np.mean(seen**2)), 1e-300)
     for _ in range(ROUNDS):
         prior, used = np.diag(1.0 / (relative**2 * max(size, 1e-300))), noise
         covariance = np.linalg.inv(gram / used + prior)

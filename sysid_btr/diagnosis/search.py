@@ -7,9 +7,9 @@ from dataclasses import replace
 from math import nan
 
 from sysid_btr.diagnosis.elimination import without_dispensable
-from sysid_btr.diagnosis.evidence import evidence_of, preference
+from sysid_btr.diagnosis.evidence import evidence_of, preference, weights
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
-from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain
+from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain, improves
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import (
     Trial,
@@ -54,7 +54,8 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
     """Whether a trial removes more than a trace, and beside others more than what these leave looks like.
 
     At one moment that is a push, and of any variable some curve. And whether the log says so, under errors as
-    correlated as those that are left: a part of a wrong model's error vanishes with almost anything.
+    correlated as those that are left: a part of a wrong model's error vanishes with almost anything. Held-out data are
+    asked alone, if they show anything of it; what happens once they cannot know.
     """
     effect, beside = trial.hypothesis.effect, bool(state.effects)
     more = has_minimum_gain(
@@ -65,7 +66,12 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
         transient=effect.transient and beside,
         learnt=effect in FREE_FORMS and beside,
     )
-    return more and preference(state.fitted, trial.fitted) >= rules.evident
+    if not more:
+        return False
+    now, then = state.fitted, trial.fitted
+    if improves(rules, now, then):
+        return preference(now, then) >= rules.evident
+    return bool(weights([now, then], then, [0, trial.hypothesis.complexity])[1] >= rules.evident)
 
 
 def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:

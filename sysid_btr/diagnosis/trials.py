@@ -74,9 +74,10 @@ def is_outdone(rules: Selection, hypothesis: Hypothesis, trials: Sequence[Trial]
 
 
 def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Sequence[Trial]) -> bool:
-    """Whether a curve is not needed yet: a law at its place explains a good part of what it promises."""
+    """Whether a curve is not needed yet: a law there explains a good part of what it promises, and harms nothing."""
     return hypothesis.effect in FREE_FORMS and any(
         float(before.train_cells.sum() - t.fitted.train_cells.sum()) >= rules.law * hypothesis.gain
+        and t.fitted.holdout < (1 + rules.transient_harm) * before.holdout
         for t in _laws_beside(hypothesis, trials)
     )
 

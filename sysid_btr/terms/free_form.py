@@ -1,4 +1,4 @@
-"""Torques, friction and encoder errors of a form that is learnt: smooth functions of what a joint does, or of time.
+"""Torques, friction, gains, encoder errors of a form that is learnt: smooth functions of what a joint does, or of time.
 
 Where no law of the library fits, a curve does: cubic B-splines over the range of the variable (de Boor 1978, "A
 Practical Guide to Splines"), whose numbers are the amounts of the modes of their roughness, the integral of the
@@ -98,15 +98,19 @@ def _kinds(bounds: Sequence[float], peak: float, size: float, unit: str = "Nm") 
     return tuple(Kind(f"c{k}", unit, 0.0, -w * peak, w * peak, w * size) for k, w in enumerate(bounds, start=1))
 
 
+def _amount_in_words(amount: float, unit: str) -> str:
+    return f"{100 * amount:.2g} %" if unit == "1" else f"{amount:.2g} {unit}"
+
+
 def curve_in_words(x: FloatArray, y: FloatArray, across: str, unit: str) -> str:
     """What a curve does: where it goes, if it goes one way, else what it lies between."""
 
     def at(i: int) -> str:
-        return f"{y[i]:.2g} {unit} at {x[i]:.2g} {across}"
+        return f"{_amount_in_words(y[i], unit)} at {x[i]:.2g} {across}"
 
     size, last = float(np.ptp(y)), len(y) - 1
     if size <= FLAT * float(np.max(np.abs(y))):
-        return f"about {float(np.mean(y)):.2g} {unit} everywhere"
+        return f"about {_amount_in_words(float(np.mean(y)), unit)} everywhere"
     way = 1.0 if y[-1] > y[0] else -1.0
     if float(np.sum(np.maximum(-way * np.diff(y), 0.0))) > FLAT * size:
         low, high = sorted((int(np.argmin(y)), int(np.argmax(y))))
@@ -173,7 +177,7 @@ class FreeCurve(Effect):
         """What is across and upwards in a drawing of the curve, with units."""
         unit, across = self._units
         variable = self.variable if across == "1" else f"{self.variable} ({across})"
-        return variable, f"{self.amount} ({unit})"
+        return variable, self.amount if unit == "1" else f"{self.amount} ({unit})"
 
     @property
     def _units(self) -> tuple[str, str]:
@@ -430,6 +434,50 @@ class FreeTorquePeriodic(FreeTorque):
         return torque
 
 
+@dataclass(frozen=True)
+class FreeGainTime(FreeCurve):
+    """A change of a drive's gain that is a smooth function of time, zero on average: a supply, heat, a grip that wears.
+
+    Law: gain = 1 + the curve at each step, and never below 0.
+    """
+
+    name: ClassVar[str] = "free_gain"
+    family: ClassVar[str] = "supply"
+    scope: ClassVar = "drive"
+    needs: ClassVar[str] = COMMANDS
+    variant: ClassVar[str] = "time"
+    label: ClassVar[str] = "free_gain.time"
+    title: ClassVar[str] = "change of gain that follows time"
+    variable: ClassVar[str] = "time"
+    variable_unit: ClassVar[str] = "s"
+    amount: ClassVar[str] = "change of gain"
+    transient: ClassVar[bool] = True
+    law_acts: ClassVar[tuple[str, ...]] = ("servo",)
+    # the constant is the gain itself
+    kinds: ClassVar[tuple[Kind, ...]] = _kinds(modal_bounds(SPLINES)[1:], 1.0, 0.05, "1")
+    includes: ClassVar[tuple[str, ...]] = ("thermal_derating",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("free_torque.time", "a load that changes its sign"),
+        ("voltage_sag", "the same at every joint"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return cls.kinds
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return 0.0, scale.seconds
+
+    @classmethod
+    def modes_at(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        return super().modes_at(x, low, high)[..., 1:]
+
+    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
+        change = modal_sum(values, self.modes_at(np.full(len(index), step.time), *self._bounds))
+        step.gain[:, index] *= np.maximum(1.0 + change, 0.0)
+
+
 def _near_frequency(
     parameters: Sequence[Parameter], values: FloatArray, kinds: int, seconds: float
 ) -> tuple[Parameter, ...]:
@@ -589,6 +637,7 @@ FREE_FORMS: tuple[type[FreeCurve], ...] = (
     FreeTorqueVelocity,
     FreeTorquePeriodic,
     FreeTorqueTime,
+    FreeGainTime,
     FreeTorqueCommand,
     FreeTorqueLoad,
 )
