@@ -254,6 +254,14 @@ def test_a_joint_of_a_fit_without_measurement_is_drawn_all_the_same(fitted: Fit)
     assert plot_residuals([empty]).shape == (1, 2)
 
 
+def test_a_result_is_shown_once_in_a_notebook(fitted: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[object] = []
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr("rich.jupyter.display", lambda *args: shown.append(args))
+    assert "mass:arm" in fitted._repr_html_()
+    assert shown == []
+
+
 def test_results_show_themselves_in_a_notebook(fitted: Fit) -> None:
     from sysid_btr.posterior.draw import posterior
     from sysid_btr.posterior.sampling import Settings

@@ -16,7 +16,10 @@ def result_html(result: Mapping[str, Any]) -> str:
     """The tables of the command line, from the content of result.json."""
     from rich.console import Console
 
-    out = Console(file=StringIO(), record=True, width=PLAIN_WIDTH, highlight=False, emoji=False, markup=False)
+    # in a notebook rich would show the tables by itself, too
+    out = Console(
+        file=StringIO(), record=True, width=PLAIN_WIDTH, force_jupyter=False, highlight=False, emoji=False, markup=False
+    )
     show(result, out)
     return out.export_html(inline_styles=True, code_format=FRAME)
 
