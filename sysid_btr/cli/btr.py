@@ -87,7 +87,8 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
     )
     draws: int | None = option(
         None,
-        "Number of models in which controllers are searched for, drawn from what is believed; 1 is the model alone.",
+        "Number of models in which controllers are searched for, drawn from the distribution of the parameters; 1 is "
+        "the model alone.",
         otherwise="8 for the choice improvement, else 1",
         metavar="N",
         least=1,

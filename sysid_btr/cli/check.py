@@ -28,17 +28,17 @@ SHOWN = 30
 class CheckOptions(ModelOptions, ReadingOptions, ParameterOptions, ThreadOptions, JsonOptions):
     """Options of `check`."""
 
-    effects: Names = option(("all",), "Effects to ask for.", metavar="all|NAME[,NAME..]", decides=False)
+    effects: Names = option(("all",), "Effects to check.", metavar="all|NAME[,NAME..]", decides=False)
     odds: float = option(
-        99.0, "Odds for an effect against none, at which it is said to show.", metavar="N", decides=False
+        99.0, "Odds in favour of an effect, from which it counts as visible.", metavar="N", decides=False
     )
     budget: float = option(60.0, "Seconds after which no further effects are tried.", metavar="SECONDS", decides=False)
 
 
 def check(options: CheckOptions) -> int:
-    """Say what a log can tell before anything is fitted: which parameters, which effects and from what size.
+    """Say what a log is informative about, before anything is fitted: which parameters, which effects, from what size.
 
-    Also how each joint moves, which drives reach their limits, and which motion would tell more.
+    Also how each joint moves, which drives reach their limits, and which motion would be more informative.
     """
     from sysid_btr.checking import check as check_logs
     from sysid_btr.progress import ProgressLine

@@ -35,7 +35,7 @@ EXIT_CODES = """
 Exit codes: 0 done; 1 a defect of this program; 2 usage; 3 a log cannot be used; 4 the model cannot be used or
 does not fit the log; 5 finished and written, but the fit did not converge or none of its parameters is identifiable
 (some not identifiable beside others that are is a result: 0); 130 interrupted, journal kept;
-141 nobody reads the output.
+141 the reader of the output closed it.
 """
 OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 """What the system says where something cannot be written."""

@@ -53,8 +53,8 @@ class ReadingOptions(LogOptions):
     )
     shift: Numbers = option(
         {},
-        "Seconds by which a channel's or column's values come later, e.g. command=1.41: streams that were started "
-        "apart.",
+        "Seconds to add to the times of a channel or column, e.g. command=1.41, where streams were not started "
+        "together.",
         metavar="NAME=SECONDS",
         decides=True,
     )
@@ -96,9 +96,11 @@ class ModeOptions(Options):
     mode: str = option(
         "auto",
         "How logs are compared: forward drives the model by their commands, segments does so from one measured state "
-        "after the other, inverse compares the torques that the motion takes.",
-        otherwise="auto: inverse where no command is logged, segments where the replay goes its own way",
-        metavar="auto|forward|segments|inverse",
+        "after the other, inverse compares the torques that the motion requires, innovations (of a floating base) each "
+        "sample with its prediction from those before it.",
+        otherwise="auto: inverse where no command is logged, segments where the replay diverges from the log, "
+        "innovations for a floating base",
+        metavar="auto|forward|segments|inverse|innovations",
         decides=True,
     )
     segments: str = option(

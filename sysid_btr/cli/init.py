@@ -24,7 +24,7 @@ class InitOptions(ModelOptions):
 
 
 def init(options: InitOptions) -> int:
-    """Write a study file to begin with: what the log holds, and what of the model it may identify, line by line.
+    """Write a study file to begin with: what the log holds, and which parameters it may identify, line by line.
 
     It runs as it is: sysid-btr fit --config FILE, or close --config FILE.
     """

@@ -23,7 +23,7 @@ class ValidateOptions(LogOptions, ModelOptions, JsonOptions):
 
 
 def validate(options: ValidateOptions) -> int:
-    """Say everything that is wrong with a log, where, and what to do about it (exit 3 on errors)."""
+    """List every problem of a log, where it is, and what to do about it (exit 3 on errors)."""
     from sysid_btr.io.problem import errors_of
     from sysid_btr.io.validation import validate_file
     from sysid_btr.models.log_checks import check_log

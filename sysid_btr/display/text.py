@@ -225,7 +225,7 @@ def exactness(result: Mapping[str, Any]) -> Iterator[str]:
             f"is left, and are {number(median(wider), 2)} times as wide (median) as if the model were right"
         )
     elif result.get("misfit"):
-        yield "the model leaves more than noise, and intervals hold for the model as it is"
+        yield "the model leaves more than noise, which the intervals do not account for"
     if allowed:
         sizes = ", ".join(f"{name} by {number(std)}" for name, std in allowed.items())
         yield f"intervals hold where what is not fitted is off: {sizes} (one standard deviation)"

@@ -270,7 +270,7 @@ class InnovationsProcedure(Procedure):
     costly: ClassVar[bool] = True
     no_torque: ClassVar[str] = "its base was floating, and samples are compared one by one"
     unseen: ClassVar[str] = (
-        "samples of a walk are compared with what those before them lead one to expect, in which this changes "
+        "samples of a walk are compared with their predictions from those before them, in which this changes "
         "nothing. Leave it out, or replay the walk on its ground: --mode segments"
     )
 
@@ -437,8 +437,8 @@ class InnovationsEpisode(Episode):
         return {
             "mode": "innovations",
             "why": self.why,
-            "summary": f"floating base: {int(self.compared.sum())} samples, each compared with what those before it "
-            "lead one to expect, whatever forces act on the feet",
+            "summary": f"floating base: {int(self.compared.sum())} samples, each compared with its prediction "
+            "from those before it, whatever forces act on the feet",
             "samples": int(self.compared.sum()),
             "events": [str(event) for event in self.base.events],
             "used_until": float(self.log.time[-1]),

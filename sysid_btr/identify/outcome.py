@@ -124,7 +124,7 @@ class StudyOutcome:
         return residuals(self.study, self.model)
 
     def __repr__(self) -> str:
-        known = [f"{e.name} {with_digits_of(e.value, e.std)} \u00b1 {e.std:.2g}" for e in self.estimates[:SHOWN]]
+        known = [f"{e.name} {with_digits_of(e.value, e.std)} (std {e.std:.2g})" for e in self.estimates[:SHOWN]]
         more = [f"{len(self.estimates) - SHOWN} more"] if len(self.estimates) > SHOWN else []
         verdict = f"{self.found['verdict']}: " if "verdict" in self.found else ""
         return f"<{type(self).__name__} of {self.study.robot.name}: {verdict}{', '.join([*known, *more])}>"
