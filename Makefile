@@ -33,14 +33,19 @@ types: $(VENV)/installed-dev
 	$(BIN)/mypy
 
 # each worker simulates on threads of its own: threads of BLAS beside them only wait for each other
-check quick notebooks: export OPENBLAS_NUM_THREADS := 1
+check quick notebooks docs: export OPENBLAS_NUM_THREADS := 1
+
+# notebooks are executed in copies that keep their outputs: `make docs` shows them
+EXECUTE = rm -rf executed && mkdir executed && cp notebooks/*.ipynb executed
 
 # the notebooks first, each is long: one at the end would leave the other worker without work
 check: $(VENV)/installed-dev
-	$(BIN)/python -m pytest $(PYTEST_FLAGS) --nbmake notebooks tests
+	$(EXECUTE)
+	$(BIN)/python -m pytest $(PYTEST_FLAGS) --nbmake --overwrite executed tests
 
 notebooks: $(VENV)/installed-dev
-	$(BIN)/python -m pytest --nbmake -p no:warnings -q notebooks
+	$(EXECUTE)
+	$(BIN)/python -m pytest --nbmake --overwrite -p no:warnings -q executed
 
 docs: $(VENV)/installed-dev
 	$(BIN)/python docs/build.py
@@ -50,7 +55,7 @@ format: $(VENV)/installed-dev
 	$(BIN)/ruff format $(SOURCES)
 
 clean:
-	rm -rf $(VENV) demo_out docs/html dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) demo_out docs/html dist executed .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 
 $(VENV)/bin/python:
 	python=$$($(FIND_PYTHON)) && $$python -m venv $(VENV)

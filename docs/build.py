@@ -1,8 +1,11 @@
-"""``make docs``: the guide's pages, tables made from the code, and the API reference from docstrings, as HTML.
+"""``make docs``: the guide's pages, tables made from the code, the notebooks with their figures, and the API reference
+from docstrings, as HTML.
 
     python docs/build.py [DIR]        # default docs/html
 
-A page is a Markdown file in docs/guide; `PAGES` has those made from code. pdoc makes the reference.
+A page is a Markdown file in docs/guide; `PAGES` has those made from code. pdoc makes the reference, nbconvert the pages
+of notebooks, with the outputs that the last `make test` or `make notebooks` left in `EXECUTED`. A notebook that was
+never executed, or whose code has changed since, is executed first.
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import nbformat
 import pdoc
+from nbformat import NotebookNode
 from pdoc.render_helpers import to_html
 
 import sysid_btr
@@ -29,12 +34,16 @@ from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.library import effects
 
 HERE = Path(__file__).parent
+NOTEBOOKS = HERE.parent / "notebooks"
+EXECUTED = HERE.parent / "executed"
+"""Notebooks with outputs, beside NOTEBOOKS because paths in them are relative."""
 TITLES = {
     "index": "Overview",
     "first_hour": "The first hour",
     "robot_and_log": "Your robot and your log",
     "verdicts": "What each verdict means",
     "reports": "The reports",
+    "notebooks": "Notebooks",
     "effects": "Effects",
     "servos": "Identified servos",
     "result": "result.json",
@@ -63,7 +72,7 @@ code {{ font-family: ui-monospace, monospace; font-size: .9em; }} pre code {{ fo
 table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
 th, td {{ padding: .35rem .9rem .35rem 0; text-align: left; vertical-align: top;
   border-bottom: 1px solid var(--line); }}
-</style></head><body><nav>{menu}</nav>
+{style}</style></head><body><nav>{menu}</nav>
 {body}
 </body></html>
 """
@@ -87,6 +96,9 @@ def main(argv: list[str]) -> int:
     for name, title in TITLES.items():
         text = PAGES[name]() if name in PAGES else (HERE / "guide" / f"{name}.md").read_text(encoding="utf-8")
         (out / f"{name}.html").write_text(page(name, title, text), encoding="utf-8")
+    for path in notebooks():
+        text = notebook_page(path.stem, executed(path), out)
+        (out / f"{path.stem}.html").write_text(text, encoding="utf-8")
     broken = sorted(set(broken_links(out)))
     if broken:
         sys.stderr.write("links that lead nowhere:\n" + "\n".join(f"  {b}" for b in broken) + "\n")
@@ -96,9 +108,123 @@ def main(argv: list[str]) -> int:
 
 
 def page(name: str, title: str, markdown: str) -> str:
+    """A page of Markdown with the menu above it."""
+    return framed(name, title, to_html(markdown))
+
+
+def framed(name: str, title: str, body: str, style: str = "") -> str:
     """A page with the menu above it."""
     menu = [f"<b>{t}</b>" if n == name else f'<a href="{n}.html">{t}</a>' for n, t in TITLES.items()]
-    return FRAME.format(title=escape(title), menu="\n".join(menu), body=to_html(markdown))
+    return FRAME.format(title=escape(title), menu="\n".join(menu), body=body, style=style)
+
+
+def notebooks() -> list[Path]:
+    """All notebooks, in their order."""
+    return sorted(NOTEBOOKS.glob("*.ipynb"))
+
+
+def heading(notebook: NotebookNode) -> tuple[str, str]:
+    """Title of a notebook, and its first paragraph."""
+    title, _, text = notebook.cells[0].source.partition("\n")
+    return title.lstrip("# "), " ".join(text.strip().partition("\n\n")[0].split())
+
+
+def notebooks_page() -> str:
+    """Every notebook, with what it begins with."""
+    lines = ["# Notebooks", "", "Worked examples with all their output; the files are in `notebooks/`.", ""]
+    for path in notebooks():
+        title, text = heading(nbformat.read(path, 4))
+        lines += [f"## [{title}]({path.stem}.html)", "", text, ""]
+    return "\n".join(lines)
+
+
+def executed(path: Path) -> NotebookNode:
+    """A notebook with outputs: those of its last execution, or of one now.
+
+    An execution stands for a notebook as long as their code is the same, it came to the end, and no cell failed.
+    """
+    notebook, kept = nbformat.read(path, 4), EXECUTED / path.name
+    if kept.exists():
+        before = nbformat.read(kept, 4)
+        if code(before) == code(notebook) and is_whole(before):
+            return with_outputs(notebook, before)
+    from nbclient import NotebookClient
+
+    sys.stderr.write(f"executing {path.name}\n")
+    NotebookClient(notebook, timeout=None).execute(cwd=str(NOTEBOOKS))
+    kept.parent.mkdir(exist_ok=True)
+    nbformat.write(notebook, kept)
+    return notebook
+
+
+def code(notebook: NotebookNode) -> list[str]:
+    """Sources of the cells of code."""
+    return [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def is_whole(notebook: NotebookNode) -> bool:
+    """Whether every cell was executed and none failed."""
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    failed = any(output.output_type == "error" for cell in cells for output in cell.outputs)
+    return not failed and all(cell.execution_count for cell in cells)
+
+
+def with_outputs(notebook: NotebookNode, before: NotebookNode) -> NotebookNode:
+    """A notebook with the outputs that the same code had before; its text is its own."""
+    outputs = iter(cell.outputs for cell in before.cells if cell.cell_type == "code")
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs = next(outputs)
+    return notebook
+
+
+def notebook_page(name: str, notebook: NotebookNode, out: Path) -> str:
+    """An executed notebook as a page; files that it links to are copied beside the page.
+
+    Raises
+    ------
+    ValueError
+        If a cell draws and the page would not have its figure.
+    """
+    from nbconvert import HTMLExporter
+    from pygments.formatters import HtmlFormatter
+
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            # lines of progress
+            cell.outputs = [o for o in cell.outputs if o.get("name") != "stderr"]
+            if draws(cell.source) and not any("image/png" in o.get("data", {}) for o in cell.outputs):
+                raise ValueError(f"{name}: no figure below\n{cell.source}")
+    exporter = HTMLExporter(template_name="basic", exclude_input_prompt=True, exclude_output_prompt=True)
+    body, _ = exporter.from_notebook_node(notebook)
+    dark = HtmlFormatter(style="github-dark").get_style_defs(".highlight")
+    style = (
+        HtmlFormatter(style="default").get_style_defs(".highlight")
+        + f"\n@media (prefers-color-scheme: dark) {{ {dark} }}\n"
+        + ".highlight, .highlight pre { background: var(--panel); } .anchor-link { display: none; }\n"
+        + "img { max-width: 100%; height: auto; } .jp-OutputArea-output img, .output_png img { background: #fff; }\n"
+    )
+    return framed(name, heading(notebook)[0], with_files(body, out), style)
+
+
+def draws(source: str) -> bool:
+    """Whether a cell ends in a figure."""
+    return re.search(r"\bplt\.(figure|subplots)\(|\.plot\b", source) is not None
+
+
+def with_files(body: str, out: Path) -> str:
+    """HTML whose links to files beside the notebooks lead to copies beside the page; what is not there is no link."""
+
+    def copied(link: re.Match[str]) -> str:
+        source = NOTEBOOKS / link["target"]
+        if not source.is_file():
+            return link["text"]
+        target = Path("files") / source.parent.name / source.name
+        (out / target).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, out / target)
+        return f'<a href="{target.as_posix()}">{link["text"]}</a>'
+
+    return re.sub(r"""<a href=(['"])(?P<target>\.\./[^'"]+)\1[^>]*>(?P<text>.*?)</a>""", copied, body)
 
 
 def effects_page() -> str:
@@ -243,6 +369,7 @@ def first_line(documented: object) -> str:
 
 
 PAGES: dict[str, Callable[[], str]] = {
+    "notebooks": notebooks_page,
     "effects": effects_page,
     "result": result_page,
     "commands": commands_page,

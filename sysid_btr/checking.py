@@ -130,12 +130,20 @@ class LogCheck:
         shown = sum(e.shows_from is not None for e in self.effects)
         parts = [f"{known} of {len(self.parameters)} parameters are identifiable from this motion"]
         parts += [f"{shown} of {len(self.effects)} effects would show"] if self.effects else []
-        for joints, what in (
-            ([j.joint for j in self.joints if j.at_rest], "hardly moves"),
-            ([j.joint for j in self.joints if j.saturated > 0], "reaches its torque limit"),
-            ([j.joint for j in self.joints if j.beyond > 0], "is commanded beyond its range"),
+        for joints, one, several in (
+            ([j.joint for j in self.joints if j.at_rest], "hardly moves", "hardly move"),
+            (
+                [j.joint for j in self.joints if j.saturated > 0],
+                "reaches its torque limit",
+                "reach their torque limits",
+            ),
+            (
+                [j.joint for j in self.joints if j.beyond > 0],
+                "is commanded beyond its range",
+                "are commanded beyond their ranges",
+            ),
         ):
-            parts += [f"{', '.join(joints)} {what}"] if joints else []
+            parts += [f"{', '.join(joints)} {one if len(joints) == 1 else several}"] if joints else []
         return "; ".join(parts) + "."
 
     @property
@@ -147,7 +155,8 @@ class LogCheck:
         poor = [p.name for p in self.parameters if p.identifiable != "yes"]
         if poor and all(e.log.meta.mount == "fixed" for e in self.study.train):
             asked = " ".join(f"--fit '{name}'" for name in poor[:4])
-            lines.append(f"a motion that tells more of {', '.join(poor[:4])}: sysid-btr excite --model {model} {asked}")
+            about = f"a motion that is more informative about {', '.join(poor[:4])}"
+            lines.append(f"{about}: sysid-btr excite --model {model} {asked}")
         if any(j.saturated > 0 for j in self.joints):
             lines.append("a drive at its limit shows the limit, not its gains: record slower or smaller motion as well")
         if not any(e.logged(("effort",)) for e in self.study.train):

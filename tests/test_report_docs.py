@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shlex
 import sys
@@ -12,8 +13,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import get_args
 
+import nbformat
 import pytest
 import typer
+from nbclient import NotebookClient
+from nbformat import NotebookNode
+from nbformat.v4 import new_output
 
 import sysid_btr
 from sysid_btr.cli import app
@@ -106,6 +111,84 @@ def test_pages_link_to_pages(build: ModuleType, tmp_path: Path) -> None:
     assert {b for b in build.broken_links(tmp_path) if "api/" not in b} == set()
     (tmp_path / "limits.html").unlink()
     assert "index.html: limits.html" in set(build.broken_links(tmp_path))
+
+
+FIGURE = base64.b64encode(b"\x89PNG\r\n\x1a\n").decode()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
+def test_every_notebook_has_a_page_with_its_figures(build: ModuleType, tmp_path: Path, path: Path) -> None:
+    pytest.importorskip("nbconvert", reason="the documentation needs the extra `dev`")
+    notebook = as_executed(build, path)
+    figures = sum(build.draws(source) for source in build.code(notebook))
+    assert figures == sum("plt" in source or "plot" in source for source in build.code(notebook))
+    page = build.notebook_page(path.stem, notebook, tmp_path)
+    assert page.count(f"data:image/png;base64,{FIGURE}") == figures
+    title, _ = build.heading(notebook)
+    assert f"<title>{title} - sysid_btr</title>" in page
+    assert "three replays" not in page  # progress
+    assert f"[{title}]({path.stem}.html)" in build.notebooks_page()
+    if figures:
+        for cell in notebook.cells:
+            cell.outputs = []
+        with pytest.raises(ValueError, match="no figure"):
+            build.notebook_page(path.stem, notebook, tmp_path)
+
+
+def as_executed(build: ModuleType, path: Path) -> NotebookNode:
+    """A notebook with a figure wherever a cell draws, and a line of progress everywhere."""
+    notebook = nbformat.read(path, 4)
+    for cell in (c for c in notebook.cells if c.cell_type == "code"):
+        cell.execution_count = 1
+        cell.outputs = [new_output("stream", name="stderr", text="fit: three replays")]
+        if build.draws(cell.source):
+            cell.outputs.append(new_output("display_data", data={"image/png": FIGURE}))
+    return notebook
+
+
+def test_a_notebook_is_executed_only_where_its_code_is_new(
+    build: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = next((ROOT / "notebooks").glob("01*.ipynb"))
+    begun: list[str] = []
+
+    def execute(client: NotebookClient, cwd: str) -> None:
+        begun.append(cwd)
+        for cell in client.nb.cells:
+            cell.update({"execution_count": 1} if cell.cell_type == "code" else {})
+
+    monkeypatch.setattr(NotebookClient, "execute", execute)
+    monkeypatch.setattr(build, "EXECUTED", tmp_path)
+    build.executed(path)
+    build.executed(path)
+    assert begun == [str(ROOT / "notebooks")]
+    kept = as_executed(build, path)
+    nbformat.write(kept, tmp_path / path.name)
+    kept.cells[0].source = "other words"
+    nbformat.write(kept, tmp_path / path.name)
+    found = build.executed(path)
+    assert found.cells[0].source != "other words"
+    assert found.cells[1].outputs
+    for spoil in ({"source": "other = 'code'"}, {"outputs": [new_output("error")]}, {"execution_count": None}):
+        spoilt = as_executed(build, path)
+        spoilt.cells[1].update(spoil)
+        nbformat.write(spoilt, tmp_path / path.name)
+        before = len(begun)
+        build.executed(path)
+        assert len(begun) == before + 1
+
+
+def test_reports_that_a_notebook_links_to_are_copied_beside_its_page(
+    build: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "NOTEBOOKS", tmp_path / "notebooks")
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "report.html").write_text("found")
+    body = "<a href='../out/report.html' target='_blank'>here</a> <a href='../out/lost.html' target='_blank'>lost</a>"
+    html = tmp_path / "html"
+    assert build.with_files(body, html) == '<a href="files/out/report.html">here</a> lost'
+    assert (html / "files" / "out" / "report.html").read_text() == "found"
 
 
 @pytest.mark.parametrize(
