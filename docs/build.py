@@ -78,6 +78,13 @@ th, td {{ padding: .35rem .9rem .35rem 0; text-align: left; vertical-align: top;
 """
 
 
+LOOKS = """.highlight, .highlight pre { background: var(--panel); } .anchor-link { display: none; }
+.output pre { background: none; padding: 0; } .output_stream pre { white-space: pre-wrap; }
+.output_png img { max-width: 100%; height: auto; background: #fff; }
+"""
+"""Of notebooks: code on a panel, output on the page."""
+
+
 def main(argv: list[str]) -> int:
     """Write all pages; 1 if a link leads nowhere."""
     out = Path(argv[0]) if argv else HERE / "html"
@@ -198,12 +205,8 @@ def notebook_page(name: str, notebook: NotebookNode, out: Path) -> str:
     exporter = HTMLExporter(template_name="basic", exclude_input_prompt=True, exclude_output_prompt=True)
     body, _ = exporter.from_notebook_node(notebook)
     dark = HtmlFormatter(style="github-dark").get_style_defs(".highlight")
-    style = (
-        HtmlFormatter(style="default").get_style_defs(".highlight")
-        + f"\n@media (prefers-color-scheme: dark) {{ {dark} }}\n"
-        + ".highlight, .highlight pre { background: var(--panel); } .anchor-link { display: none; }\n"
-        + "img { max-width: 100%; height: auto; } .jp-OutputArea-output img, .output_png img { background: #fff; }\n"
-    )
+    style = f"{HtmlFormatter().get_style_defs('.highlight')}\n@media (prefers-color-scheme: dark) {{ {dark} }}\n{LOOKS}"
+    body = body.replace("No description has been provided for this image", "figure")
     return framed(name, heading(notebook)[0], with_files(body, out), style)
 
 
