@@ -74,11 +74,11 @@ class ExciteOptions(ModelOptions, LogOptions, ParameterOptions, SeedOptions, Thr
 
 
 def excite(options: ExciteOptions) -> int:
-    """Design a motion that makes chosen parameters identifiable, with the intervals to expect before and after.
+    """Design a motion that makes chosen parameters identifiable, and say which intervals to expect from it.
 
-    Writes excite.parquet, a log of commands to play on the robot (its torso fixed), result.json and a figure. What is
-    before is the motion of --log, which also gives the noise of the sensors, or else the first motion of the search.
-    Only the limits of the joints keep the motion from hitting the robot itself or the ground.
+    Writes excite.parquet, a log of commands to play on the robot (its torso fixed), result.json and a figure. It is
+    compared with the motion of --log, which also gives the noise of the sensors, or else with the first motion of the
+    search. Only the limits of the joints keep the motion from hitting the robot itself or the ground.
     """
     from sysid_btr.excite import outcome
     from sysid_btr.result import exit_code
