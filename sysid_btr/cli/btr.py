@@ -119,7 +119,8 @@ def btr(options: BtrOptions) -> int:
     """Back to Reality: search a controller in the model, try it on the robot, correct the model by that, again.
 
     The robot is a simulation that the search does not see (--robot-sim), or a real one behind a folder (--exchange).
-    Exit 5 if the model no longer predicts which controller is better on the robot; the results are written all the same.
+    Exit 5 if the model no longer predicts which controller is better on the robot; the results are written all the
+    same.
     """
     from sysid_btr.btr.controllers import get_space
     from sysid_btr.btr.loop import back_to_reality
