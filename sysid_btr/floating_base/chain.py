@@ -371,7 +371,7 @@ def stale(chain: Chain, known: Derivatives, values: FloatArray, number: int) -> 
     size, kinds, felt = each_of(NUDGE, chain), _nudged_forces(chain), _felt(chain)
     on = np.zeros(len(size))
     on[felt] = size[felt]
-    sign = np.random.default_rng(number).choice([-0.5, 0.5], size=len(size) + len(kinds))
+    sign = np.random.default_rng(number).choice(np.array([-0.5, 0.5]), size=len(size) + len(kinds))
     touch = np.repeat(chain.touch, 6, axis=1)
     change = sign * np.hstack([np.tile(on, (len(touch), 1)), kinds * touch])
     every = np.arange(len(touch))

@@ -256,7 +256,7 @@ def assess(chains: Sequence[FloatArray]) -> Convergence:
     longest = float(np.max([autocorrelation_time(c[:steps]) for c in chains]))
     burn_in = int(min(np.ceil(BURN_IN * longest), steps // 2)) if np.isfinite(longest) else steps // 2
     kept = [c[burn_in:steps] for c in chains]
-    tau = np.max([autocorrelation_time(c) for c in kept], axis=0)
+    tau = np.max(np.stack([autocorrelation_time(c) for c in kept]), axis=0)
     rhat = np.full(p, np.inf)
     if steps - burn_in >= 4:
         stacked = np.stack([c.reshape(-1, p) for c in kept])

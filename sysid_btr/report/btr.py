@@ -109,9 +109,9 @@ def _parameter(axis: Axes, rounds: Sequence[Mapping[str, Any]], name: str, truth
             continue
         losses = np.array(_numbers(r["models"]["losses"]))
         order = np.argsort(-np.nan_to_num(losses, nan=np.inf), kind="stable")[-SHOWN:]
-        shade = np.linspace(0.05, 0.5, len(order))
+        shades = [(faint(), float(a)) for a in np.linspace(0.05, 0.5, len(order))]
         place = np.full(len(order), float(r["number"]))
-        axis.scatter(place, values[order, names.index(name)], s=10, color=faint(), alpha=shade.tolist(), lw=0)
+        axis.scatter(place, values[order, names.index(name)], s=10, color=shades, lw=0)
     x = [r["number"] for r in rounds if name in r["model"]]
     axis.plot(x, [r["model"][name] for r in rounds if name in r["model"]], color=ink())
     if truth is not None:
