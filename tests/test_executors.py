@@ -302,23 +302,26 @@ def stall_once(folder: Path, of: ReplayProblem, rows: FloatArray) -> FloatArray:
     return np.asarray(of._losses(rows).sum(axis=1))
 
 
-def marks(folder: Path, rows: FloatArray) -> list[int]:
-    """How often each candidate was begun."""
-    return [len((folder / f"{row[0]!r}").read_text().splitlines()) for row in rows]
-
-
-def test_a_worker_that_dies_costs_its_share_only(pool: DaskExecutor, tmp_path: Path) -> None:
+def test_a_worker_that_dies_costs_its_share_only(
+    pool: DaskExecutor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # on a busy machine a piece may be late, and done twice for that
+    monkeypatch.setattr("sysid_btr.executors.pool.LEAST_LATE", np.inf)
+    monkeypatch.setattr("sysid_btr.executors.pool.STALLED", np.inf)
+    pool._client.wait_for_workers(2)
+    pool.late.clear()
     whole = problem(pool)
     rows = candidates(whole, 64)
     (tmp_path / "victim").write_text(repr(rows[-1][0]))
     found = pool.run(partial(die_once, tmp_path), whole, rows)
     assert np.array_equal(found, problem().loss(rows))
     assert (tmp_path / "dead").exists()
-    pieces = [piece for _, piece in cut(undivided, len(rows), 2)]
-    begun = [set(marks(tmp_path, rows[piece])) for piece in pieces]
-    assert begun[-1] == {2}  # what it had begun
-    assert all(len(count) == 1 for count in begun)
-    assert begun.count({1}) >= len(pieces) // 2
+    begun_by = [(tmp_path / f"{row[0]!r}").read_text().splitlines() for row in rows]
+    dead = begun_by[-1][0]
+    assert len(begun_by[-1]) == 2  # what it had begun
+    others = [each for each in begun_by if each[0] != dead]
+    assert others
+    assert all(len(each) == 1 for each in others)
 
 
 def test_a_fit_goes_on_when_a_worker_dies(pool: DaskExecutor) -> None:

@@ -147,8 +147,8 @@ class SlewLimit(Effect):
         most = np.where(off, np.inf, values[:, :, 0] * batch.timestep)
         if off.all():
             return shaped
-        now = wanted[:, 0].copy()
+        now = wanted[:, 0]
         for k in range(wanted.shape[1]):
-            now += np.clip(wanted[:, k] - now, -most, most)
+            now = np.where(off, wanted[:, k], now + np.clip(wanted[:, k] - now, -most, most))
             shaped[:, k, columns] = now
         return shaped
