@@ -103,13 +103,15 @@ def _difference(axis: Axes, rounds: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _parameter(axis: Axes, rounds: Sequence[Mapping[str, Any]], name: str, truth: float | None) -> None:
+    from matplotlib.colors import to_rgba
+
     for r in rounds:
         names, values = list(r["models"]["names"]), np.array(r["models"]["values"], dtype=np.float64)
         if name not in names or not len(values):
             continue
         losses = np.array(_numbers(r["models"]["losses"]))
         order = np.argsort(-np.nan_to_num(losses, nan=np.inf), kind="stable")[-SHOWN:]
-        shades = [(faint(), float(a)) for a in np.linspace(0.05, 0.5, len(order))]
+        shades = [to_rgba(faint(), float(a)) for a in np.linspace(0.05, 0.5, len(order))]
         place = np.full(len(order), float(r["number"]))
         axis.scatter(place, values[order, names.index(name)], s=10, color=shades, lw=0)
     x = [r["number"] for r in rounds if name in r["model"]]
