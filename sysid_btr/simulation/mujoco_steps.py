@@ -86,7 +86,7 @@ def roll_out(setup: Setup, fields: Fields, borders: IntArray, threads: int) -> S
     stop = np.zeros(1, dtype=np.int64)
     with ThreadPoolExecutor(count) as pool:
         try:
-            owned = list(_threads(model, rows, setup.state, count))
+            owned = list(threads_of(model, rows, setup.state, count))
             jobs = [
                 pool.submit(roll, m * t // count, m * (t + 1) // count, plan, own, thread, kept, stop)
                 for t, (thread, _) in enumerate(owned)
@@ -101,7 +101,7 @@ def roll_out(setup: Setup, fields: Fields, borders: IntArray, threads: int) -> S
     return states
 
 
-def _threads(model: mujoco.MjModel, fields: Fields, state: Fields, count: int) -> Iterator[tuple[Thread, Any]]:
+def threads_of(model: mujoco.MjModel, fields: Fields, state: Fields, count: int) -> Iterator[tuple[Thread, Any]]:
     """What each thread simulates with, and the objects that own it."""
     import mujoco
 
