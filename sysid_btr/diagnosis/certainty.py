@@ -16,8 +16,7 @@ FAINT = 1e-3
 """How near to 0 and 1 a share is believed."""
 
 UNSIZED = 0.5
-"""Most that is said of a name none of whose numbers is identifiable: something is needed there, and it is not more likely
-than not to be what it is called."""
+"""Most that is said of a name none of whose numbers is identifiable: it is not more likely than not."""
 
 
 @dataclass(frozen=True)
