@@ -16,6 +16,7 @@ from conftest import make_good_log
 import sysid_btr as sb
 from sysid_btr.cli.demo import sample_logs
 from sysid_btr.diagnosis.closing import Closing
+from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.display.tables import to_tables
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.identify.fit import Fit
@@ -195,7 +196,16 @@ def test_signatures_are_those_of_what_is_called() -> None:
     assert list(shown.parameters) == list(real.parameters)
     assert [p.default for p in shown.parameters.values()] == [p.default for p in real.parameters.values()]
     for name in sb.__all__:
-        assert "args" not in inspect.signature(getattr(sb, name)).parameters, name
+        signature = inspect.signature(getattr(sb, name))
+        assert "args" not in signature.parameters, name
+        # as `help` shows it: no addresses, no defaults of many lines
+        assert " at 0x" not in str(signature), name
+        assert all(len(str(p)) < 120 for p in signature.parameters.values()), name
+
+
+def test_thresholds_show_what_was_changed() -> None:
+    assert repr(Selection()) == "Selection()"
+    assert repr(Selection(rounds=3)) == "Selection(rounds=3)"
 
 
 class Terminal(io.StringIO):
