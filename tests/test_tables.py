@@ -6,6 +6,7 @@ import inspect
 import io
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import correlations
 from sysid_btr.io.log import Log
 from sysid_btr.progress import ProgressLine, shows_progress, watched
+from sysid_btr.units import with_digits_of
 
 SAMPLES = sample_logs()
 MODEL = str(SAMPLES / "pendulum.xml")
@@ -184,6 +186,15 @@ def test_a_line_says_what_a_thing_is(name: str, request: pytest.FixtureRequest) 
         assert len(repr(thing)) < 200
         assert "array(" not in repr(thing)
     assert f"mass:arm {outcome.estimates[0].value:.2f}"[:11] in repr(outcome)
+
+
+def test_a_line_says_what_was_found(closed: Closing) -> None:
+    [effect] = closed.effects
+    assert repr(effect) == f"<NamedEffect {effect.sentence}; friction with over 99 % certainty>"
+    [friction] = effect.parameters
+    assert repr(friction) == f"<Estimate coulomb_friction:pendulum {with_digits_of(friction.value, friction.std)} Nm (std {friction.std:.2g})>"
+    unseen = replace(friction, identifiable="no", std=math.inf)
+    assert repr(unseen) == "<Estimate coulomb_friction:pendulum not identifiable>"
 
 
 # --- signatures and progress ------------------------------------------------------------------------------------
