@@ -192,7 +192,8 @@ def test_a_line_says_what_was_found(closed: Closing) -> None:
     [effect] = closed.effects
     assert repr(effect) == f"<NamedEffect {effect.sentence}; friction with over 99 % certainty>"
     [friction] = effect.parameters
-    assert repr(friction) == f"<Estimate coulomb_friction:pendulum {with_digits_of(friction.value, friction.std)} Nm (std {friction.std:.2g})>"
+    value = with_digits_of(friction.value, friction.std)
+    assert repr(friction) == f"<Estimate coulomb_friction:pendulum {value} Nm (std {friction.std:.2g})>"
     unseen = replace(friction, identifiable="no", std=math.inf)
     assert repr(unseen) == "<Estimate coulomb_friction:pendulum not identifiable>"
 
