@@ -39,9 +39,10 @@ class CheckOptions(ModelOptions, ReadingOptions, ParameterOptions, ThreadOptions
 
 
 def check(options: CheckOptions) -> int:
-    """Say what a log is informative about, before anything is fitted: which parameters, which effects, from what size.
+    """Say what a log is informative about, before anything is fitted.
 
-    Also how each joint moves, which drives reach their limits, and which motion would be more informative.
+    Which parameters are identifiable and with what error, which effects would show and from what size, how each joint
+    moves, which drives reach their limits, and which motion would be more informative.
     """
     from sysid_btr.checking import check as check_logs
     from sysid_btr.progress import ProgressLine
