@@ -223,17 +223,22 @@ def check(
     threads: int = 0,
     progress: Progress = watched,
 ) -> LogCheck:
-    """Say what logs can tell of a robot, before anything is fitted.
+    """Say what logs are informative about, before anything is fitted.
 
     Parameters
     ----------
     robot, logs : model and recordings.
     parameters : expressions of the grammar, as for `fit`.
     effects : names of effects, or ``all``.
-    odds : for an effect against none, at which it is said to show.
+    odds : in favour of an effect, from which it counts as visible.
     budget : s, after which no further effects are tried.
     threads : worker threads, 0 for all cores.
     progress : is told what is going on.
+
+    Returns
+    -------
+    LogCheck
+        Joints, parameters, effects, problems, and advice; its tables by ``to_pandas``.
 
     Raises
     ------

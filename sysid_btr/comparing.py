@@ -217,6 +217,11 @@ def compare(
     dates : ISO 8601, one a run; default when its first fitted log was recorded, if the log says so.
     threads : worker threads for `logs`, 0 for all cores.
 
+    Returns
+    -------
+    Comparison
+        Parameters, effects and errors side by side, and remarks on what makes the runs less comparable.
+
     Raises
     ------
     UsageError
