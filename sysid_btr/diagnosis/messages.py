@@ -15,7 +15,7 @@ from sysid_btr.units import probability, si_all, with_digits_of
 
 
 def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
-    """One effect with places, amounts and intervals."""
+    """One effect with places and amounts; what follows +- is half of the 95 % interval, and the sentence says so."""
     kinds = len(effect.kinds)
     parts = []
     for i, group in enumerate(effect.groups):
@@ -25,7 +25,8 @@ def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
         )
         where = "" if effect.scope == "robot" else f" at {_places(group.split(','))}"
         parts.append(f"{where}: {amounts}")
-    return effect.title + ";".join(parts)
+    text = effect.title + ";".join(parts)
+    return f"{text} (95 %)" if "+-" in text else text
 
 
 def _places(names: Sequence[str]) -> str:
@@ -96,12 +97,12 @@ def _partly(effects: Sequence[NamedEffect], rest: str, left: Mapping[str, Any] |
     """What is likely, what else was added, and what is left."""
     likely = [e for e in effects if e.likely]
     text = "Partly explained: the model lacks " + "; ".join(
-        f"{e.sentence} ({e.family} with {probability(e.certainty)} certainty{', its form open' * e.provisional})"
+        f"{e.sentence}, {e.family} with {probability(e.certainty)} certainty{', its form open' * e.provisional}"
         for e in likely
     )
     others = [e for e in effects if not e.likely]
     if others:
-        added = "; ".join(f"{e.sentence} ({probability(e.certainty)})" for e in others)
+        added = "; ".join(f"{e.sentence}, {e.family} with {probability(e.certainty)} certainty" for e in others)
         text += f". Also added, less likely than not to be what it is called: {added}"
     text += f". Of the squared error above the noise, {rest} is left"
     return text + (f": {left.get('summary', 'not characterised')}." if left else ".")
