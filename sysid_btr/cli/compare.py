@@ -36,9 +36,10 @@ class CompareOptions(ModelOptions, ReadingOptions, ThreadOptions, JsonOptions):
 
 
 def compare(options: CompareOptions) -> int:
-    """Compare finished runs of one robot: which parameters differ, what drifts, which effects came or went.
+    """Compare finished runs of one robot: what differs, what drifts.
 
-    With --log also the error of every run's model on a common log.
+    Parameters side by side, which differences are real, and which effects came or went; with --log also the error of
+    every run's model on a common log.
     """
     from sysid_btr.comparing import compare as compare_runs
 
