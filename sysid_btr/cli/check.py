@@ -48,7 +48,7 @@ def check(options: CheckOptions) -> int:
     from sysid_btr.progress import ProgressLine
 
     robot = find_robot(options, options.bounds)
-    logs = as_stated(read_logs(options.log), options)
+    logs = as_stated(read_logs(options.log, robot), options)
     warn_of(robot, logs)
     with ProgressLine("check") as progress:
         found = check_logs(

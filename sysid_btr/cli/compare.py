@@ -47,7 +47,7 @@ def compare(options: CompareOptions) -> int:
         raise UsageError("which runs? Give the --out folders of two or more: sysid-btr compare monday friday")
     _check_free(options)
     robot = None if options.model is None else find_robot(options)
-    logs = as_stated(read_logs(options.log), options) if options.log else []
+    logs = as_stated(read_logs(options.log, robot), options) if options.log else []
     if robot is not None:
         warn_of(robot, logs)
     found = compare_runs(options.runs, logs=logs, robot=robot, dates=options.dates or None, threads=options.threads)

@@ -91,7 +91,7 @@ def excite(options: ExciteOptions) -> int:
         raise UsageError("--out DIR is required: the folder for the motion")
     if len(options.log) > 1:
         raise UsageError("a motion is compared with one reference: give --log once")
-    reference = read_logs(options.log)[0] if options.log else None
+    reference = read_logs(options.log, robot)[0] if options.log else None
     found, folder = _search(options, robot, reference)
     result = outcome.make_result(found, seed=options.seed)
     remark(f"report: {save_motion(folder, found, result)}")

@@ -33,7 +33,7 @@ def init(options: InitOptions) -> int:
     from sysid_btr.run_folder import Folder
 
     robot = find_robot(options)
-    logs = read_logs(options.files)
+    logs = read_logs(options.files, robot)
     target = output_file(options.out, options.files, options.overwrite)
     warn_of(robot, logs)
     text = study_file(robot, logs, options.model or robot.name, target)

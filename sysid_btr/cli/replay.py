@@ -51,7 +51,7 @@ def replay(options: ReplayOptions) -> int:
     """
     began = time.perf_counter()
     robot = find_robot(options)
-    logs = as_stated(read_logs(options.log, motions=True), options)
+    logs = as_stated(read_logs(options.log, robot, motions=True), options)
     model, numerics = _changed(robot, options)
     targets = _targets(options.out, logs, options.overwrite)
     warn_of(robot, [one for one in logs if not one.is_motion])
