@@ -639,10 +639,17 @@ def test_the_limit_of_a_verdict_grows_with_chance() -> None:
 
 @pytest.mark.parametrize(
     ("last", "floating", "expected"),
-    [(3.5, False, True), (3.7, False, False), (16.0, True, True), (16.2, True, False), (1.0, False, True)],
+    [(3.5, False, True), (3.7, False, False), (4.9, True, True), (5.1, True, False), (1.0, False, True)],
 )
 def test_is_explained(last: float, floating: bool, expected: bool) -> None:
     assert is_explained(RULES, 101.0, last, 1.1, floating=floating) is expected
+
+
+def test_what_is_far_above_the_noise_is_not_explained_however_much_is_gone() -> None:
+    """A motor's friction of the wrong form took 97.5 % of the error of an arm, and 480 noise floors were left."""
+    assert is_explained(RULES, 1e6, 4.9, 1.1, floating=False)
+    assert not is_explained(RULES, 1e6, 5.1, 1.1, floating=False)
+    assert verdict_of(RULES, fitted([1e6]), fitted([2e4]), (SURE,), floating=False) == "partly_explained"
 
 
 def a_name(certainty: float, *rivals: str) -> NamedEffect:
