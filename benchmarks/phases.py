@@ -1,0 +1,152 @@
+"""Where the CPU time of a run goes: physics, laws, linear algebra, set-up, choosing the step, everything else.
+
+A thread looks every few milliseconds at the Python stack of the one that works, and gives the CPU time that the process
+has used since to the part of the first rule that fits. Nothing is slowed down, and nothing has to know of it.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import process_time
+from types import FrameType
+from typing import Any
+
+from sysid_btr.simulation.numerics import INTEGRATORS
+
+EVERY = 0.005
+"""s between two looks."""
+STEP = "choosing the step"
+SETUP = "set-up"
+ONE, MANY = "physics of one candidate", "physics"
+LAWS, ALGEBRA, REPORT, REST = "laws", "linear algebra", "report", "else"
+PARTS = (MANY, ONE, LAWS, ALGEBRA, STEP, SETUP, REPORT, REST)
+
+WHOLE = {
+    "choose_numerics": STEP,
+    "realise_servo": STEP,
+    "with_short_steps": STEP,
+    "write_all": REPORT,
+    "describe_model": REPORT,
+    "print_result": REPORT,
+}
+"""Functions whose time is of one part, whatever they call."""
+FOLDERS = (
+    ("sysid_btr/simulation/stepping.py", LAWS),
+    ("sysid_btr/terms/", LAWS),
+    ("numpy/linalg/", ALGEBRA),
+    ("scipy/linalg/", ALGEBRA),
+    ("sysid_btr/floating_base/chain.py", ALGEBRA),
+    ("sysid_btr/floating_base/innovations.py", ALGEBRA),
+    ("sysid_btr/objectives/", ALGEBRA),
+    ("sysid_btr/estimators/lsq.py", ALGEBRA),
+    ("sysid_btr/identify/study.py", SETUP),
+    ("sysid_btr/io/", SETUP),
+    ("sysid_btr/models/", SETUP),
+    ("sysid_btr/simulation/compiling.py", SETUP),
+    ("<frozen importlib", SETUP),
+)
+"""Beginnings of paths, the first that fits the innermost frame, then the one that called it, and so on."""
+
+
+@dataclass
+class Phases:
+    """CPU seconds by part, of this process, and the steps that the simulator took.
+
+    Attributes
+    ----------
+    seconds : by part.
+    steps : of one simulation each, by the name of the integrator; one evaluation of the dynamics without a step counts
+        as a step of Euler's method.
+    calls : into the simulator, by the name of its method.
+    """
+
+    seconds: Counter[str] = field(default_factory=Counter)
+    steps: Counter[str] = field(default_factory=Counter)
+    calls: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def physics(self) -> float:
+        """CPU seconds inside MuJoCo."""
+        return self.seconds[ONE] + self.seconds[MANY]
+
+    def to_dict(self) -> dict[str, float]:
+        """Shares of all CPU time."""
+        whole = sum(self.seconds.values()) or 1.0
+        return {part: round(self.seconds[part] / whole, 3) for part in PARTS}
+
+
+@contextmanager
+def watched() -> Iterator[Phases]:
+    """Watch what this thread does."""
+    found, done, watching = Phases(), threading.Event(), threading.get_ident()
+
+    def look() -> None:
+        before = process_time()
+        while not done.wait(EVERY):
+            now = process_time()
+            found.seconds[_part_of(sys._current_frames().get(watching))] += now - before
+            before = now
+
+    thread = threading.Thread(target=look, daemon=True)
+    with _counting(found):
+        thread.start()
+        try:
+            yield found
+        finally:
+            done.set()
+            thread.join()
+
+
+@contextmanager
+def _counting(found: Phases) -> Iterator[None]:
+    """Count the steps of every simulation, by wrapping the simulator's methods."""
+    from mujoco import mjtIntegrator
+    from mujoco.batch import Batch
+
+    integrators = {getattr(mjtIntegrator, f"mjINT_{name.upper()}").value: name for name in INTEGRATORS}
+
+    def counted(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+        def physics(batch: Any, *args: Any, **options: Any) -> Any:
+            found.calls[name] += 1
+            if name != "set_const":
+                rows = int(args[0]) if name == "rollout" else 1
+                integrator = "Euler" if name == "forward" else integrators[batch.model.opt.integrator]
+                found.steps[integrator] += rows * int(batch.nsim)
+            return method(batch, *args, **options)
+
+        return physics
+
+    own = {name: getattr(Batch, name) for name in ("rollout", "step", "forward", "set_const")}
+    for name, method in own.items():
+        setattr(Batch, name, counted(name, method))
+    try:
+        yield
+    finally:
+        for name, method in own.items():
+            setattr(Batch, name, method)
+
+
+def _part_of(frame: FrameType | None) -> str:
+    """The part that a stack, from its innermost frame on, belongs to."""
+    stack = []
+    while frame is not None:
+        stack.append(frame)
+        frame = frame.f_back
+    for outer in reversed(stack):
+        if (whole := WHOLE.get(outer.f_code.co_name)) is not None:
+            return whole
+    for inner in stack:
+        code = inner.f_code
+        if code.co_name == "physics" and code.co_filename == __file__:
+            return ONE if int(inner.f_locals["batch"].nsim) == 1 else MANY
+        place = Path(code.co_filename).as_posix()
+        for beginning, part in FOLDERS:
+            if beginning in place:
+                return part
+    return REST
