@@ -55,6 +55,7 @@ from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.marginal import Projection
 from sysid_btr.objectives.problem import BLOCK, Comparison
 from sysid_btr.objectives.targets import Target
+from sysid_btr.progress import mention
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import BASE, BaseStates, Segments
 from sysid_btr.terms.base import Outputs, Term
@@ -459,6 +460,7 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
     terms = Terms(chain.steps.terms)
     numbers, step = np.arange(len(values)), NUDGE_NUMBER * (terms.upper - terms.lower)
     for k in range(rounds):
+        mention(f"states of the base, round {k + 1} of {rounds}")
         # how large jolts are is told once states have moved, at the numbers that suit them best
         sized = slice(None if k == rounds - 2 else 0)
         ends = simulate_chain(chain, values, numbers[sized], step[sized])
