@@ -45,6 +45,15 @@ def even(chi2: float, stretches: int = 20) -> np.ndarray:
     return np.full((1, stretches), chi2)
 
 
+def test_a_cause_of_no_size_is_not_more_likely_than_not() -> None:
+    """A pendulum's payload of any mass at a place anywhere predicts better: that names nothing."""
+    known = {"family": 0.999, "place": 1.0, "left": 0.01}
+    assert STANDARD.certainty(known) > 0.9
+    assert STANDARD.certainty(known, sized=False) == 0.5
+    doubtful = known | {"left": 0.9}
+    assert STANDARD.certainty(doubtful, sized=False) == STANDARD.certainty(doubtful) < 0.5
+
+
 def test_models_that_leave_alike_weigh_alike_and_a_parameter_costs_what_it_gains_by_chance() -> None:
     same = [left(even(2.0)), left(even(2.0))]
     np.testing.assert_allclose(weights(same, same[0], [1, 1]), [0.5, 0.5])

@@ -45,24 +45,24 @@ class PlainLoop:
         for row, data in enumerate(datas):
             for name, values in setup.state.items():
                 getattr(data, name)[...] = values[row]
-        names = ("qpos", "qvel", "ctrl", "qfrc_applied", "qfrc_bias")
-        arrays = {name: np.stack([getattr(data, name) for data in datas]) for name in names}
-        fields: dict[str, np.ndarray] = {}
+        arrays: dict[str, np.ndarray] = {}
 
-        def field_of(name: str) -> np.ndarray:
-            fields.setdefault(name, np.stack([getattr(model, name) for model in models]))
-            return fields[name]
+        def owner(row: int, name: str) -> object:
+            return datas[row] if hasattr(datas[row], name) else models[row]
+
+        def array_of(name: str) -> np.ndarray:
+            arrays[name] = np.stack([getattr(owner(row, name), name) for row in range(setup.size)])
+            return arrays[name]
 
         def advance() -> None:
             for row, (model, data) in enumerate(zip(models, datas, strict=True)):
-                for name, values in fields.items():
-                    getattr(model, name)[...] = values[row]
-                data.ctrl[:], data.qfrc_applied[:] = arrays["ctrl"][row], arrays["qfrc_applied"][row]
+                for name, values in arrays.items():
+                    getattr(owner(row, name), name)[...] = values[row]
                 mujoco.mj_step(model, data)
                 for name in ("qpos", "qvel", "qfrc_bias"):
                     arrays[name][row] = getattr(data, name)
 
-        states = step_through(setup, borders, field_of, arrays.__getitem__, advance)
+        states = step_through(setup, borders, array_of, advance)
         states.failed = np.array([any(warning.number > 0 for warning in data.warning) for data in datas])
         return states
 

@@ -15,6 +15,9 @@ from dataclasses import dataclass
 FAINT = 1e-3
 """How near to 0 and 1 a share is believed."""
 
+UNSIZED = 0.5
+"""Most that is said of a name none of whose numbers is identifiable: it is not more likely than not."""
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -32,15 +35,16 @@ class Calibration:
     place: float
     explained: float
 
-    def certainty(self, evidence: Mapping[str, float]) -> float:
-        """Probability, 0 to 1, from the evidence of an effect."""
+    def certainty(self, evidence: Mapping[str, float], *, sized: bool = True) -> float:
+        """Probability, 0 to 1, from the evidence of an effect, of which any number is identifiable if it is `sized`."""
         total = (
             self.constant
             + self.family * log_odds(evidence["family"])
             + self.place * log_odds(evidence["place"])
             + self.explained * log_odds(1 - evidence["left"])
         )
-        return 1 / (1 + math.exp(-total))
+        probability = 1 / (1 + math.exp(-total))
+        return probability if sized else min(probability, UNSIZED)
 
 
 def log_odds(share: float) -> float:

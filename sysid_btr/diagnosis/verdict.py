@@ -91,7 +91,8 @@ def _named(
     now = state.fitted
     left = left_where_it_acts(off, now)
     known = {"family": evidence.family, "place": evidence.place, "left": left}
-    sure = certainty.STANDARD.certainty(known)
+    sized = any(estimate.identifiable != "no" for estimate in own)
+    sure = certainty.STANDARD.certainty(known, sized=sized)
     rest = sum(evidence.others.values())
     otherwise = {name: (1 - sure) * weight / max(rest, evidence.family) for name, weight in evidence.others.items()}
     return NamedEffect(

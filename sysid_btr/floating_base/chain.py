@@ -269,10 +269,10 @@ def chainable(log: Log, terms: Sequence[Term]) -> bool:
 
 def remembers(term: type[Term]) -> bool:
     """Whether a term of this class takes more than a step from one state to the next: memory, clocks, sensors."""
-    return term.structural or any(term.overrides(hook) for hook in BEYOND)
+    return term.structural or term.law_memory > 0 or any(term.overrides(hook) for hook in BEYOND)
 
 
-BEYOND = ("start_law", "applied_torque", "initial_state", "read_out")
+BEYOND = ("applied_torque", "initial_state", "read_out")
 """Stages of such a term."""
 
 

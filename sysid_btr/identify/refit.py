@@ -121,7 +121,7 @@ def refit(
     rng, budget = np.random.default_rng(0), budget or Budget()
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
-    # where laws act, a step costs what they cost, whatever the integrator; play makes the objective rough
+    # play makes the objective rough; of laws that fit badly the corrections take more than they save
     costly = structural or model.terms.have_laws
     cheaper = study.procedure.deferred or not (polish or costly)
     if cheaper and study.numerics != study.cheap:

@@ -6,10 +6,10 @@ Not declared, and there to be found: back-EMF, friction, armature.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -17,7 +17,8 @@ import numpy as np
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
 from sysid_btr.models.robot import Robot, robot_from_spec
-from sysid_btr.terms.base import Step, Term
+from sysid_btr.terms.base import Term
+from sysid_btr.terms.law import Step
 
 if TYPE_CHECKING:
     import mujoco
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from sysid_btr.io.log import Log
 
 JOINT = "pendulum"
-TICKS = 4096 / (2 * pi)
+TICKS = 4096 / (2 * math.pi)
 """Encoder ticks per rad."""
 KP_DIVISOR = 256
 """By which the firmware divides its kp register."""
@@ -62,14 +63,17 @@ class Supply(Term):
     name: ClassVar[str] = "supply"
     switches: ClassVar[bool] = True
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        for joint, column in zip(self.places, index, strict=True):
-            voltage = step.inputs.get(f"voltage.{joint}", np.float64(self.nominal))
-            enabled = step.inputs.get(f"enabled.{joint}", np.float64(1.0))
-            ratio = voltage / self.nominal * enabled
-            step.gain[:, column] *= ratio
-            step.limit_low[:, column] *= ratio
-            step.limit_high[:, column] *= ratio
+    def law_numbers(self, values: FloatArray) -> FloatArray:
+        return np.full((len(values), len(self.places), 1), self.nominal)
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            logged = not math.isnan(step.voltage[j])
+            ratio = (step.voltage[j] / numbers[p, 0] if logged else 1.0) * step.enabled[j]
+            step.gain[j] *= ratio
+            step.limit_low[j] *= ratio
+            step.limit_high[j] *= ratio
 
 
 def xl330() -> Robot:

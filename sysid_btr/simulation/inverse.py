@@ -8,7 +8,7 @@ these move nothing here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from hashlib import sha256
@@ -21,7 +21,7 @@ from sysid_btr.simulation.kinematics import Kinematics
 from sysid_btr.simulation.mujoco_batch import VELOCITY, evaluate
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import Law, Values, laws_of, write_terms
-from sysid_btr.terms.base import BatchModel, Outputs, Step
+from sysid_btr.terms.base import BatchModel, Outputs, Term
 
 if TYPE_CHECKING:
     import mujoco
@@ -73,15 +73,15 @@ class InverseReplay(Replay):
         armature, damping, friction = (batch.read(name)[:, self.index.dof] for name in fields)
         shared, applied = self._tendon_friction(batch), self._applied(batch, pairs)
         laws = tuple(law for law in laws_of(self.index, pairs) if not needs_history(type(law.term)))
+        act = _acting(laws, motion, m)
         for i, rigid in enumerate(self._rigid(batch)):
             rotors = armature[i] * motion.acceleration
             smooth = rigid.torque + rotors + damping[i] * motion.velocity + shared[min(i, len(shared) - 1)]
             effort[i] = smooth + friction[i] * motion.direction
             for _ in range(ROUNDS if laws else 0):
                 # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
-                step = self._under_laws(laws, i, effort[i], rigid.load + rotors)
-                own = np.maximum(friction[i] + step.friction, 0.0)
-                effort[i] = smooth + own * motion.direction - step.joint_torque
+                rubbed, pushed = act(i, effort[i], rigid.load + rotors)
+                effort[i] = smooth + np.maximum(friction[i] + rubbed, 0.0) * motion.direction - pushed
         outputs = Outputs(
             motion.time,
             np.array(np.broadcast_to(motion.position, shape)),
@@ -146,34 +146,33 @@ class InverseReplay(Replay):
                 applied = applied + torque
         return applied
 
-    def _under_laws(self, laws: tuple[Law, ...], candidate: int, torque: FloatArray, load: FloatArray) -> Step:
-        """What laws of one candidate add; the samples stand where a rollout has its candidates."""
-        motion = self.motion
-        n, joints = motion.position.shape
-        step = Step(
-            time=0.0,
-            timestep=motion.period,
-            command=motion.position,
-            qpos=motion.position,
-            qvel=motion.velocity,
-            torque=torque,
-            gain=np.ones((n, joints)),
-            motor_torque=np.zeros((n, joints)),
-            joint_torque=np.zeros((n, joints)),
-            friction=np.zeros((n, joints)),
-            limit_low=np.full((n, joints), -np.inf),
-            limit_high=np.full((n, joints), np.inf),
-            inputs={},
-            load=load,
-        )
-        for law in laws:
-            law.term.law(step, law.values[candidate][None], None, law.places)
-        return step
+
+Acting = Callable[[int, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""Candidate, torques of its drives and loads, (n, j) each -> friction and torques at the joints that laws add."""
 
 
-def needs_history(term: type) -> bool:
+def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> Acting:
+    """What laws do on the samples of a motion."""
+    if not laws:
+        return lambda candidate, torque, load: (np.zeros(torque.shape), np.zeros(torque.shape))
+    # imports what compiles laws, which takes a second
+    from sysid_btr.simulation.laws import on_samples, table_of
+
+    table, numbers = table_of(laws, candidates)
+    position, velocity = (np.ascontiguousarray(x) for x in (motion.position, motion.velocity))
+
+    def act(candidate: int, torque: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray]:
+        friction, pushed = np.zeros(position.shape), np.zeros(position.shape)
+        own = numbers[candidate]
+        on_samples(table, own, motion.period, position, velocity, torque, load, friction, pushed)
+        return friction, pushed
+
+    return act
+
+
+def needs_history(term: type[Term]) -> bool:
     """Whether a kind of term acts by what was before, or through a joint of its own, and so not on single samples."""
-    return term.overrides("start_law") or term.structural  # type: ignore[attr-defined, no-any-return]
+    return term.law_memory > 0 or term.structural
 
 
 def fixed_tendon(model: mujoco.MjModel, tendon: int) -> FloatArray:

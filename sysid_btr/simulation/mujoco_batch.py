@@ -11,7 +11,6 @@ import numpy as np
 from sysid_btr._typing import IntArray
 from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.simulator import States
-from sysid_btr.simulation.stepping import step_through
 from sysid_btr.terms.base import BatchModel, Fields
 
 if TYPE_CHECKING:
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
 
 SEGMENT = 1024
 """Steps per rollout call; bounds the records that are held at once."""
-SHARED = 0.5
-"""Fraction of simulations that differ from all others, up to which what is the same is derived once."""
 POSITION, VELOCITY, ACCELERATION = 1, 2, 3
 """Stages of MuJoCo's forward dynamics (mjtStage)."""
 
@@ -30,11 +27,13 @@ class MujocoBatch:
     """Simulations of a `mujoco.batch.Batch`, on as many threads as are asked for."""
 
     def rollout(self, setup: Setup, borders: IntArray, *, threads: int = 0) -> States:
-        batch = _load(setup.batch, setup.state, threads)
         if setup.laws or setup.held_steps:
-            states = step_through(setup, borders, batch.expand, batch.bind, batch.step)
-        else:
-            states = _roll(batch, setup, borders)
+            # imports what compiles laws, which takes a second
+            from sysid_btr.simulation.mujoco_steps import roll_out
+
+            return roll_out(setup, _derived(setup.batch, threads), borders, threads)
+        batch = _load(setup.batch, setup.state, threads)
+        states = _roll(batch, setup, borders)
         states.failed = batch.warning[:, :, 1].sum(axis=1) > 0
         return states
 
@@ -54,36 +53,31 @@ def _load(batch: BatchModel, state: Fields, threads: int) -> Batch:
     from mujoco.batch import Batch
 
     simulations = Batch(batch.model, batch.size, threads)
-    for name, values in batch.fields.items():
+    for name, values in _derived(batch, threads).items():
         simulations.expand(name)[...] = values
-    if batch.derives:
-        _derive(simulations, batch, threads)
     for name, values in state.items():
         simulations.bind(name)[...] = values
     return simulations
 
 
-def _derive(simulations: Batch, batch: BatchModel, threads: int) -> None:
-    """Let the engine derive what depends on changed fields, once for simulations in which these are the same."""
+def _derived(batch: BatchModel, threads: int) -> Fields:
+    """Changed fields of all candidates, and what the engine derives from them, once for those that are the same."""
     from mujoco import MjModel
     from mujoco.batch import Batch
 
+    if not batch.derives:
+        return batch.fields
     changed = [name for name in batch.fields if name in MjModel._setconst_inputs]
     numbers = np.concatenate([batch.fields[name].reshape(batch.size, -1) for name in changed], axis=1)
     first: dict[bytes, int] = {}
     same = [first.setdefault(row.tobytes(), i) for i, row in enumerate(numbers)]
-    if len(first) > SHARED * batch.size:
-        simulations.set_const()
-        return
     rows, own = np.unique(same, return_inverse=True)
     few = Batch(batch.model, len(rows), threads)
     for name in changed:
         few.expand(name)[...] = batch.fields[name][rows]
     few.set_const()
-    for name in MjModel._setconst_outputs:
-        derived = few.expanded(name)
-        if derived is not None and name not in changed:
-            simulations.expand(name)[...] = derived[own]
+    derived = {name: few.expanded(name) for name in MjModel._setconst_outputs if name not in changed}
+    return batch.fields | {name: values[own] for name, values in derived.items() if values is not None}
 
 
 def _roll(batch: Batch, setup: Setup, borders: IntArray) -> States:

@@ -26,7 +26,8 @@ class _LogConfig(ctypes.Structure):
 
 
 @cache
-def _library() -> ctypes.CDLL | None:
+def mujoco_library() -> ctypes.CDLL | None:
+    """MuJoCo's C library that is loaded, None if it is none that can be silenced."""
     import mujoco
 
     found = sorted(Path(mujoco.__file__).parent.glob("*mujoco*.so*")) + sorted(
@@ -45,7 +46,7 @@ def _library() -> ctypes.CDLL | None:
 
 def silence() -> None:
     """Keep MuJoCo silent for good, in a process that does nothing else: threads would undo each other's `silenced`."""
-    library = _library()
+    library = mujoco_library()
     if library is not None:
         now = library.mju_getLogConfig()
         library.mju_setLogConfig(_LogConfig(False, False, now.logfile, now.topics))
@@ -55,7 +56,7 @@ def silence() -> None:
 @contextmanager
 def silenced() -> Iterator[None]:
     """Run MuJoCo without its console and file messages, and without its timers; the settings are restored after."""
-    library = _library()
+    library = mujoco_library()
     if library is None:
         yield
         return

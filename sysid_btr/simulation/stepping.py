@@ -1,170 +1,345 @@
-"""Rollouts step by step, for what an engine cannot do by itself: servos that hold their torque, laws of terms."""
+"""Rollouts step by step, for what an engine cannot do by itself: servos that hold their torque, laws of terms.
+
+All of it is compiled; see `laws` for how a law becomes machine code.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.simulation.laws import Laws, apply_laws, table_of
 from sysid_btr.simulation.servo import ServoLaw
-from sysid_btr.simulation.setup import Setup, as_ctrl
+from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.simulator import States
-from sysid_btr.terms.base import Step
+from sysid_btr.terms.law import ROWS, Step
 
-Arrays = Callable[[str], Any]
-"""Field of MuJoCo -> its (m, ...) array of a simulator, read and written in place."""
+COMMAND, QPOS, QVEL, TORQUE, LOAD, VOLTAGE, ENABLED, GAIN, MOTOR, JOINT, FRICTION, LOW, HIGH = range(ROWS)
+"""Rows of a step's arrays, in the order of `Step`."""
 
 
-def step_through(setup: Setup, borders: IntArray, model: Arrays, data: Arrays, advance: Callable[[], None]) -> States:
+class Plan(NamedTuple):
+    """What is the same for all candidates of a setup; attributes as of `Setup` and `JointAddresses`.
+
+    Attributes
+    ----------
+    servo, limit, friction : whether a law changes these.
+    driven : (d,) positions among the joints of those with a drive.
+    """
+
+    laws: Laws
+    timestep: float
+    steps: int
+    held_steps: int
+    servo: bool
+    limit: bool
+    friction: bool
+    qpos: IntArray
+    dof: IntArray
+    scale: FloatArray
+    driven: IntArray
+    actuator: IntArray
+    control: IntArray
+
+
+class Candidates(NamedTuple):
+    """What candidates (m,) differ in.
+
+    Attributes
+    ----------
+    command, command_of : (u, steps, j), and which of them each has, (m,).
+    voltage, enabled, applied, control : (m, steps, j or c), or (0, 0, 0) where there are none.
+    gear, gain, constant, stiffness, damping, least, most : (m, d) of the servos, see `ServoLaw`.
+    low, high : (m, j).
+    numbers : (m, n) of the laws.
+    own_gain, own_bias, own_friction : actuator_gainprm and actuator_biasprm (m, d, 10), dof_frictionloss (m, j), as
+        they are without laws.
+    """
+
+    command: FloatArray
+    command_of: IntArray
+    voltage: FloatArray
+    enabled: FloatArray
+    applied: FloatArray
+    control: FloatArray
+    gear: FloatArray
+    gain: FloatArray
+    constant: FloatArray
+    stiffness: FloatArray
+    damping: FloatArray
+    least: FloatArray
+    most: FloatArray
+    low: FloatArray
+    high: FloatArray
+    numbers: FloatArray
+    own_gain: FloatArray
+    own_bias: FloatArray
+    own_friction: FloatArray
+
+
+class Engine(NamedTuple):
+    """One candidate's arrays in a simulator, by MuJoCo's names, which are read and written in place."""
+
+    qpos: FloatArray
+    qvel: FloatArray
+    ctrl: FloatArray
+    qfrc_applied: FloatArray
+    qfrc_bias: FloatArray
+    actuator_gainprm: FloatArray
+    actuator_biasprm: FloatArray
+    actuator_forcelimited: BoolArray
+    actuator_forcerange: FloatArray
+    actuator_ctrllimited: BoolArray
+    dof_frictionloss: FloatArray
+
+
+STATE = Engine._fields[:5]
+"""Arrays of an engine that are of MjData, those after them of MjModel."""
+
+
+class Memory(NamedTuple):
+    """What is remembered of a candidate from step to step: arrays of `Step`, velocities, held torques, laws' memory."""
+
+    step: FloatArray
+    q: FloatArray
+    v: FloatArray
+    before: FloatArray
+    held: FloatArray
+    laws: FloatArray
+
+
+def plan_of(setup: Setup) -> tuple[Plan, Candidates]:
+    """A setup as compiled code takes it."""
+    batch, index = setup.batch, setup.index
+    law, acts = ServoLaw.of(batch), frozenset(name for law in setup.laws for name in law.term.law_acts)
+    laws, numbers = table_of(setup.laws, setup.size)
+    actuator = index.actuator[law.driven]
+    command, command_of = _apart(setup.command)
+    plan = Plan(
+        laws,
+        batch.timestep,
+        setup.steps,
+        setup.held_steps,
+        "servo" in acts,
+        "limit" in acts,
+        "friction" in acts,
+        np.ascontiguousarray(index.qpos),
+        np.ascontiguousarray(index.dof),
+        np.ascontiguousarray(index.scale),
+        np.ascontiguousarray(law.driven),
+        np.ascontiguousarray(actuator),
+        np.ascontiguousarray(index.control),
+    )
+    shape = (setup.size, len(law.driven))
+    none = np.zeros((0, 0, 0))
+    floats = (
+        *_inputs(setup),
+        *(none if x is None else x for x in (setup.applied, setup.control)),
+        *(law.gear, law.gain, law.constant, law.stiffness, law.damping),
+        *(np.broadcast_to(x, shape) for x in (law.least, law.most)),
+        *(law.low, law.high, numbers),
+        *(batch.read(name)[:, actuator] for name in ("actuator_gainprm", "actuator_biasprm")),
+        batch.read("dof_frictionloss")[:, index.dof],
+    )
+    rest = [np.ascontiguousarray(x, dtype=np.float64) for x in floats]
+    return plan, Candidates(command, command_of, *rest)
+
+
+def written(setup: Setup) -> tuple[str, ...]:
+    """Fields of the model that the steps of a setup write, beside those that candidates differ in."""
+    acts = {name for law in setup.laws for name in law.term.law_acts}
+    held = bool(setup.held_steps)
+    names = {
+        "dof_frictionloss": "friction" in acts,
+        "actuator_gainprm": held or "servo" in acts,
+        "actuator_biasprm": held or "servo" in acts,
+        "actuator_forcelimited": held or "limit" in acts,
+        "actuator_forcerange": "limit" in acts,
+        "actuator_ctrllimited": held,
+    }
+    return tuple(name for name, is_written in names.items() if is_written)
+
+
+def _apart(values: FloatArray) -> tuple[FloatArray, IntArray]:
+    """(u, ...) the different ones among values (m, ...), and which of them each is; equal ones are one broadcast."""
+    if values.strides[0] == 0:
+        return np.array(values[:1], dtype=np.float64, order="C"), np.zeros(len(values), dtype=np.int64)
+    return np.ascontiguousarray(values, dtype=np.float64), np.arange(len(values))
+
+
+def _inputs(setup: Setup) -> tuple[FloatArray, FloatArray]:
+    """Voltages and flags of the drives, (m, steps, j) each; (0, 0, 0) where none are logged."""
+    joints, found = setup.index.joints, []
+    for kind, missing in (("voltage", np.nan), ("enabled", 1.0)):
+        given = {j: setup.inputs[name] for j, joint in enumerate(joints) if (name := f"{kind}.{joint}") in setup.inputs}
+        values = np.full((setup.size, setup.steps, len(joints)) if given else (0, 0, 0), missing)
+        for j, own in given.items():
+            values[:, :, j] = own.T
+        found.append(values)
+    return found[0], found[1]
+
+
+def _torque(i: int, plan: Plan, own: Candidates, command: Any, q: Any, v: Any, torque: Any) -> None:
+    """Torques (j,) that the servos would like to give."""
+    torque[:] = 0.0
+    for d in range(len(plan.driven)):
+        j = plan.driven[d]
+        total = own.gain[i, d] * min(max(command[j], own.least[i, d]), own.most[i, d]) + own.constant[i, d]
+        total = total + own.stiffness[i, d] * q[j] + own.damping[i, d] * v[j]
+        torque[j] = total * own.gear[i, d]
+
+
+torque_of = numba.njit(cache=True, nogil=True, error_model="numpy")(_torque)
+
+
+def _given(i: int, plan: Plan, own: Candidates, memory: Memory, torque: Any) -> None:
+    """Torques (j,) of the servos at the start of the present step, under its laws."""
+    step = memory.step
+    torque_of(i, plan, own, step[COMMAND], memory.q, memory.v, torque)
+    for j in range(len(torque)):
+        asked = step[GAIN, j] * torque[j] + step[MOTOR, j]
+        torque[j] = min(max(asked, step[LOW, j]), step[HIGH, j])
+
+
+given_torque = numba.njit(cache=True, nogil=True, error_model="numpy")(_given)
+
+
+def _begin(i: int, plan: Plan, own: Candidates, engine: Engine) -> Memory:
+    """Memory of a candidate at the start, and a model whose actuators give the torque that is asked of them."""
+    joints = len(plan.dof)
+    if plan.held_steps > 0:
+        for a in plan.actuator:
+            engine.actuator_gainprm[a] = 0.0
+            engine.actuator_gainprm[a, 0] = 1.0
+            engine.actuator_biasprm[a] = 0.0
+            engine.actuator_forcelimited[a] = False
+            engine.actuator_ctrllimited[a] = False
+    step = np.zeros((ROWS, joints))
+    step[VOLTAGE], step[ENABLED] = np.nan, 1.0
+    q, v, before, held = np.zeros(joints), np.zeros(joints), np.zeros(joints), np.zeros(len(plan.driven))
+    return Memory(step, q, v, before, held, np.zeros(plan.laws.memory[-1]))
+
+
+begin = numba.njit(cache=True, nogil=True, error_model="numpy")(_begin)
+
+
+def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Memory) -> None:
+    """Write what acts on candidate i during step k: servos, laws and known torques."""
+    step, q, v, laws = memory.step, memory.q, memory.v, len(plan.laws.address) > 0
+    step[COMMAND] = own.command[own.command_of[i], k]
+    step[GAIN], step[MOTOR], step[JOINT], step[FRICTION] = 1.0, 0.0, 0.0, 0.0
+    step[LOW], step[HIGH] = own.low[i], own.high[i]
+    for j in range(len(q)):
+        q[j], v[j] = engine.qpos[plan.qpos[j]], engine.qvel[plan.dof[j]]
+    if laws:
+        h = plan.timestep
+        for j in range(len(q)):
+            step[QVEL, j] = 1.5 * v[j] - 0.5 * (v[j] if k == 0 else memory.before[j])
+            step[QPOS, j] = q[j] + 0.5 * h * step[QVEL, j]
+            memory.before[j] = v[j]
+            step[LOAD, j] = engine.qfrc_bias[plan.dof[j]]
+        if own.voltage.size:
+            step[VOLTAGE] = own.voltage[i, k]
+        if own.enabled.size:
+            step[ENABLED] = own.enabled[i, k]
+        torque_of(i, plan, own, step[COMMAND], step[QPOS], step[QVEL], step[TORQUE])
+        step[TORQUE] = np.minimum(np.maximum(step[TORQUE], step[LOW]), step[HIGH])
+        seen = Step(
+            k * h + 0.5 * h,
+            h,
+            step[COMMAND],
+            step[QPOS],
+            step[QVEL],
+            step[TORQUE],
+            step[LOAD],
+            step[VOLTAGE],
+            step[ENABLED],
+            step[GAIN],
+            step[MOTOR],
+            step[JOINT],
+            step[FRICTION],
+            step[LOW],
+            step[HIGH],
+        )
+        apply_laws(plan.laws, own.numbers[i], memory.laws, seen)
+        if plan.friction:
+            for j in range(len(q)):
+                engine.dof_frictionloss[plan.dof[j]] = max(own.own_friction[i, j] + step[FRICTION, j], 0.0)
+    if plan.held_steps > 0:
+        if k % plan.held_steps == 0:
+            torque = np.empty(len(q))
+            given_torque(i, plan, own, memory, torque)
+            for d in range(len(plan.driven)):
+                memory.held[d] = torque[plan.driven[d]] / own.gear[i, d]
+        for d in range(len(plan.driven)):
+            engine.ctrl[plan.actuator[d]] = memory.held[d]
+    else:
+        for d in range(len(plan.driven)):
+            a, j = plan.actuator[d], plan.driven[d]
+            engine.ctrl[a] = step[COMMAND, j] * plan.scale[j]
+            if plan.servo:
+                engine.actuator_gainprm[a] = own.own_gain[i, d] * step[GAIN, j]
+                engine.actuator_biasprm[a] = own.own_bias[i, d] * step[GAIN, j]
+                engine.actuator_biasprm[a, 0] += step[MOTOR, j] / own.gear[i, d]
+            if plan.limit:
+                # limits are torques at the joint, MuJoCo's are forces before the gear, which may turn the other way
+                low, high = step[LOW, j] / own.gear[i, d], step[HIGH, j] / own.gear[i, d]
+                low, high = min(low, high), max(low, high)
+                engine.actuator_forcelimited[a] = np.isfinite(low) or np.isfinite(high)
+                engine.actuator_forcerange[a, 0] = low if np.isfinite(low) else 0.0
+                engine.actuator_forcerange[a, 1] = high if np.isfinite(high) else 0.0
+    if own.control.size:
+        for c in range(len(plan.control)):
+            engine.ctrl[plan.control[c]] = own.control[i, k, c]
+    if laws or own.applied.size:
+        for j in range(len(q)):
+            known = own.applied[i, k, j] if own.applied.size else 0.0
+            engine.qfrc_applied[plan.dof[j]] = step[JOINT, j] + known
+
+
+act = numba.njit(cache=True, nogil=True, error_model="numpy")(_act)
+
+
+def step_through(setup: Setup, borders: IntArray, arrays: Callable[[str], Any], advance: Callable[[], None]) -> States:
     """Roll out by steps of a simulator, between which servos and laws act on its arrays.
+
+    For simulators that are not built in; `mujoco_steps` has a loop that is compiled as a whole.
 
     Parameters
     ----------
     setup, borders : as of `Simulator.rollout`.
-    model : arrays of compiled fields, with the candidates' numbers in them.
-    data : arrays of `qpos`, `qvel`, `ctrl` and `qfrc_applied`, in the initial state; where there are laws also of
-        `qfrc_bias` as of the last step, at first zero.
+    arrays : MuJoCo's name of one of the arrays of an `Engine` -> it with all candidates, (m, ...): compiled fields with
+        the candidates' numbers in them, and data in the initial state.
     advance : takes one step of all candidates, from these arrays to these arrays.
     """
-    drive = _Drive(setup, model, data)
-    qpos, qvel, slot = data("qpos"), data("qvel"), 0
-    positions, velocities = (np.empty((len(borders), *x.shape)) for x in (qpos, qvel))
-    states = States.empty(setup.size, len(borders), setup.index, effort=setup.effort and drive.alters_torque)
+    plan, own = plan_of(setup)
+    whole = [arrays(name) for name in Engine._fields]
+    engines = [Engine(*(array[i] for array in whole)) for i in range(setup.size)]
+    memories = [begin(i, plan, own, engine) for i, engine in enumerate(engines)]
+    positions, velocities = (np.empty((setup.size, len(borders), array.shape[1])) for array in whole[:2])
+    states = States.empty(setup.size, len(borders), setup.index, effort=gives_effort(setup))
+    slots = {int(border): slot for slot, border in enumerate(borders)}
     for k in range(setup.steps + 1):
-        kept = slot < len(borders) and borders[slot] == k
-        if kept:
-            positions[slot], velocities[slot] = qpos, qvel
-            slot += 1
+        slot = slots.get(k)
+        if slot is not None:
+            positions[:, slot], velocities[:, slot] = whole[0], whole[1]
         if k == setup.steps:
             break
-        drive.act(k)
-        if kept and states.effort is not None:
-            states.effort[:, slot - 1] = drive.torque()
+        for i, (engine, memory) in enumerate(zip(engines, memories, strict=True)):
+            act(k, i, plan, own, engine, memory)
+            if slot is not None and states.effort is not None:
+                given_torque(i, plan, own, memory, states.effort[i, slot])
         advance()
-    states.put(setup.index, np.arange(slot), positions.swapaxes(0, 1), velocities.swapaxes(0, 1))
+    states.put(setup.index, np.arange(len(borders)), positions, velocities)
     states.repeat_last_effort()
     return states
 
 
-class _Drive:
-    """Servos, laws of terms and known torques, at each step written into the arrays of a simulator."""
-
-    def __init__(self, setup: Setup, model: Arrays, data: Arrays) -> None:
-        self.setup, self.law = setup, ServoLaw.of(setup.batch)
-        self.laws = [(law, law.term.start_law(setup.batch, law.values)) for law in setup.laws]
-        self.acts = frozenset(name for law in setup.laws for name in law.term.law_acts)
-        self.held: FloatArray | None = None
-        self.step: Step | None = None
-        self.previous: FloatArray | None = None
-        index, driven = setup.index, self.law.driven
-        self.driven, self.actuators = in_a_row(driven), in_a_row(index.actuator[driven])
-        self.dof, self.place = in_a_row(index.dof), in_a_row(index.qpos)
-        self.qpos, self.qvel, self.ctrl, self.qfrc = (data(n) for n in ("qpos", "qvel", "ctrl", "qfrc_applied"))
-        if self.laws:
-            self.load, self.ones = data("qfrc_bias"), np.ones((setup.size, len(index.joints)))
-        if "friction" in self.acts:
-            self.friction = model("dof_frictionloss")
-            self.own_friction = self.friction[:, self.dof].copy()
-        if setup.held_steps or "servo" in self.acts:
-            self.gain, self.bias = model("actuator_gainprm"), model("actuator_biasprm")
-            self.own_gain, self.own_bias = self.gain[:, self.actuators].copy(), self.bias[:, self.actuators].copy()
-        if setup.held_steps or "limit" in self.acts:
-            self.limited, self.limits = model("actuator_forcelimited"), model("actuator_forcerange")
-        if setup.held_steps:
-            # the torque is the command, and nothing else
-            self.gain[:, self.actuators] = np.eye(1, self.gain.shape[-1])
-            self.bias[:, self.actuators] = 0.0
-            self.limited[:, self.actuators] = False
-            model("actuator_ctrllimited")[:, self.actuators] = False
-
-    @property
-    def alters_torque(self) -> bool:
-        """Whether the torque of a servo is another than that of its own law in the present state."""
-        return bool(self.laws) and (self.setup.held_steps > 0 or not self.acts.isdisjoint({"servo", "limit"}))
-
-    def act(self, k: int) -> None:
-        """Write what acts during step k."""
-        setup = self.setup
-        self.command = command = setup.command[:, k]
-        joint_torque = None if setup.applied is None else setup.applied[:, k]
-        ticks = setup.held_steps > 0 and k % setup.held_steps == 0
-        if self.laws or ticks:
-            # not as views: what a step leaves behind is remembered at the next one
-            self.q, self.v = self.qpos[:, self.place].copy(), self.qvel[:, self.dof].copy()
-        if self.laws:
-            self.step = step = self._under_laws(k, command)
-            self._write(step)
-            joint_torque = step.joint_torque if joint_torque is None else step.joint_torque + joint_torque
-        if ticks:
-            self.held = self.torque()[:, self.driven] / self.law.gear
-        if self.held is None:
-            self.ctrl[:, self.actuators] = as_ctrl(setup.index, self.driven, command[:, self.driven])
-        else:
-            self.ctrl[:, self.actuators] = self.held
-        if setup.control is not None:
-            self.ctrl[:, setup.index.control] = setup.control[:, k]
-        if joint_torque is not None:
-            self.qfrc[:, self.dof] = joint_torque
-
-    def torque(self) -> FloatArray:
-        """Torque (m, j) of the servos at the start of the present step, under its laws."""
-        if self.step is None:
-            return self.law.torque(self.command, self.q, self.v)
-        step = self.step
-        total = step.gain * self.law.unlimited(self.command, self.q, self.v) + step.motor_torque
-        return np.minimum(np.maximum(total, step.limit_low), step.limit_high)
-
-    def _under_laws(self, k: int, command: FloatArray) -> Step:
-        setup, h = self.setup, self.setup.batch.timestep
-        before = self.v if self.previous is None else self.previous
-        v_mid = 1.5 * self.v - 0.5 * before
-        q_mid = self.q + 0.5 * h * v_mid
-        self.previous = self.v
-        step = Step(
-            time=k * h + 0.5 * h,
-            timestep=h,
-            command=command,
-            qpos=q_mid,
-            qvel=v_mid,
-            torque=self.law.torque(command, q_mid, v_mid),
-            gain=self.ones.copy(),
-            motor_torque=np.zeros(self.q.shape),
-            joint_torque=np.zeros(self.q.shape),
-            friction=np.zeros(self.q.shape),
-            limit_low=self.law.low.copy(),
-            limit_high=self.law.high.copy(),
-            inputs={name: values[k] for name, values in setup.inputs.items()},
-            load=self.load[:, self.dof].copy(),
-        )
-        for law, memory in self.laws:
-            law.term.law(step, law.values, memory, law.places)
-        return step
-
-    def _write(self, step: Step) -> None:
-        """Write what the laws changed."""
-        d, actuators, gear = self.driven, self.actuators, self.law.gear
-        if "friction" in self.acts:
-            self.friction[:, self.dof] = np.maximum(self.own_friction + step.friction, 0.0)
-        if self.setup.held_steps:
-            return
-        if "servo" in self.acts:
-            gain = step.gain[:, d, None]
-            self.gain[:, actuators] = self.own_gain * gain
-            self.bias[:, actuators] = self.own_bias * gain
-            self.bias[:, actuators, 0] += step.motor_torque[:, d] / gear
-        if "limit" in self.acts:
-            # limits are torques at the joint, MuJoCo's are forces before the gear, which may turn the other way
-            one, other = step.limit_low[:, d] / gear, step.limit_high[:, d] / gear
-            low, high = np.minimum(one, other), np.maximum(one, other)
-            finite: BoolArray = np.isfinite(low) | np.isfinite(high)
-            self.limited[:, actuators] = finite
-            self.limits[:, actuators, 0] = np.where(finite, low, 0.0)
-            self.limits[:, actuators, 1] = np.where(finite, high, 0.0)
-
-
-def in_a_row(index: IntArray) -> IntArray | slice:
-    """The same positions as a slice where they follow each other, which is several times faster than by number."""
-    first = int(index[0]) if len(index) else 0
-    return slice(first, first + len(index)) if np.array_equal(index, first + np.arange(len(index))) else index
+def gives_effort(setup: Setup) -> bool:
+    """Whether torques are asked for that are others than those of the servos' own law in the present state."""
+    acts = {name for law in setup.laws for name in law.term.law_acts}
+    return setup.effort and bool(setup.laws) and (setup.held_steps > 0 or not acts.isdisjoint({"servo", "limit"}))

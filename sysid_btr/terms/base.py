@@ -16,6 +16,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.terms.drives import DriveKind
+from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, largest_scale
 
 if TYPE_CHECKING:
@@ -166,38 +167,6 @@ class BatchModel:
 
 
 @dataclass
-class Step:
-    """What a law sees and adds to at one simulation step; arrays are (candidates, joints of the log).
-
-    `qpos` and `qvel` are the motor side, extrapolated to the middle of the step, which makes a law that is
-    held over the step second-order accurate. `torque` is the plain servo's torque there, `load` the torque by which
-    gravity and the motion of the links load the joint, as of the last step.
-    Laws add to `motor_torque`, `joint_torque`, `friction`; multiply `gain`; narrow `limit`.
-    """
-
-    time: float
-    timestep: float
-    command: FloatArray
-    qpos: FloatArray
-    qvel: FloatArray
-    torque: FloatArray
-    gain: FloatArray
-    motor_torque: FloatArray
-    joint_torque: FloatArray
-    friction: FloatArray
-    limit_low: FloatArray
-    limit_high: FloatArray
-    inputs: dict[str, FloatArray]
-    load: FloatArray
-
-    @property
-    def drive(self) -> FloatArray:
-        """The servo's torque under what other laws have done to it so far."""
-        total = self.gain * self.torque + self.motor_torque
-        return np.minimum(np.maximum(total, self.limit_low), self.limit_high)
-
-
-@dataclass
 class Outputs:
     """Predicted sensors at the log's sample times; arrays are (candidates, samples, joints of the log).
 
@@ -257,6 +226,8 @@ class Term:
     """Whether its law takes the torque of a drive away where the log's `enabled` is false."""
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")
     """What the law may change beside the joint torque: gain and motor torque, friction, limits."""
+    law_memory: ClassVar[int] = 0
+    """Numbers that the law keeps from step to step at each place; zero at the start."""
 
     @property
     def called(self) -> str:
@@ -399,12 +370,13 @@ class Term:
         """Joint torque known in advance, (m, steps, joints of the log), or None."""
         return None
 
-    def start_law(self, batch: BatchModel, values: FloatArray) -> Any:
-        """Memory of the law at the start of a replay."""
-        return None
+    def law_numbers(self, values: FloatArray) -> FloatArray:
+        """What the law needs of values (m, places, kinds) and places: (m, places, n)."""
+        return values
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        """Act at every step; `index` are the positions of the places among the joints of the log."""
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        """Act at every step, see `terms.law`; `places` are positions among the joints of the log."""
 
     def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
         """Change what the sensors show, in place."""

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Outputs, Parameter, Step
+from sysid_btr.terms.base import BatchModel, Kind, Outputs, Parameter
 from sysid_btr.terms.effect import COMMANDS, Effect, Probe
+from sysid_btr.terms.law import Step, drive, used_in_laws
 from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, scale_at
 
 if TYPE_CHECKING:
@@ -94,6 +95,48 @@ def modal_sum(values: FloatArray, modes: FloatArray) -> FloatArray:
     return np.asarray(total)
 
 
+@used_in_laws
+def spline(coefficients: FloatArray, x: float) -> float:
+    """Value at x of the splines of `smooth_modes` with coefficients (SPLINES,), by de Boor's recursion."""
+    pieces = len(coefficients) - DEGREE
+    # no index follows from what is not a number
+    x = min(x, 1.0) if x > 0 else 0.0
+    k = min(int(x * pieces), pieces - 1)
+    a, b, c, d = coefficients[k], coefficients[k + 1], coefficients[k + 2], coefficients[k + 3]
+    d = c + _share(x, k + 3, 1, pieces) * (d - c)
+    c = b + _share(x, k + 2, 1, pieces) * (c - b)
+    b = a + _share(x, k + 1, 1, pieces) * (b - a)
+    d = c + _share(x, k + 3, 2, pieces) * (d - c)
+    c = b + _share(x, k + 2, 2, pieces) * (c - b)
+    value: float = c + _share(x, k + 3, 3, pieces) * (d - c)
+    return value
+
+
+@used_in_laws
+def _share(x: float, k: int, turn: int, pieces: int) -> float:
+    """Where x is between the knots between which a turn of the recursion mixes coefficient k with the one before."""
+    low, high = max(k - DEGREE, 0) / pieces, min(k + 1 - turn, pieces) / pieces
+    return (x - low) / (high - low)
+
+
+@used_in_laws
+def in_range(x: Any, low: Any, high: Any) -> Any:
+    """Where in its range a variable is, 0 .. 1 within; arrays or single numbers, as of the following."""
+    return (x - low) / (high - low)
+
+
+@used_in_laws
+def in_velocities(x: Any, high: Any) -> Any:
+    """The same of a velocity of either sign; slow ones are told apart more finely."""
+    return 0.5 + 0.5 * np.arcsinh(np.minimum(np.maximum(x / high, -1.0), 1.0) / CREEP) / np.arcsinh(1.0 / CREEP)
+
+
+@used_in_laws
+def in_speeds(x: Any, high: Any) -> Any:
+    """The same of a velocity whatever its sign."""
+    return np.arcsinh(np.minimum(np.abs(x) / high, 1.0) / CREEP) / np.arcsinh(1.0 / CREEP)
+
+
 def _kinds(bounds: Sequence[float], peak: float, size: float, unit: str = "Nm") -> tuple[Kind, ...]:
     return tuple(Kind(f"c{k}", unit, 0.0, -w * peak, w * peak, w * size) for k, w in enumerate(bounds, start=1))
 
@@ -138,21 +181,30 @@ class FreeCurve(Effect):
     variable_unit: ClassVar[str] = ""
     amount: ClassVar[str] = "torque"
     article: ClassVar[str] = "a "
+    first_mode: ClassVar[int] = 0
+    """Which of the modes over a range is the first that it has."""
 
     @classmethod
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         """What the variable covers at a joint."""
         raise NotImplementedError
 
-    @classmethod
-    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
-        """Where in its range, 0 .. 1, the variable is; it stays at the ends beyond them."""
-        return np.minimum(np.maximum((x - low) / (high - low), 0.0), 1.0)
+    @staticmethod
+    def position_in(x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        """Where in its range the variable is, 0 .. 1; the curve stays what it is at the ends beyond them."""
+        return np.asarray(in_range(x, low, high))
 
     @classmethod
     def modes_at(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
         """(..., modes) of the curve at values of the variable."""
-        return np.asarray(smooth_modes()(cls.position_in(x, low, high)))
+        inside = np.minimum(np.maximum(cls.position_in(x, low, high), 0.0), 1.0)
+        return np.asarray(smooth_modes()(inside)[..., cls.first_mode :])
+
+    def law_numbers(self, values: FloatArray) -> FloatArray:
+        """The ends of the range, and the coefficients of the splines: (m, places, 2 + SPLINES)."""
+        ends = np.broadcast_to(np.stack(self._bounds, axis=1), (*values.shape[:2], 2))
+        modes = smooth_modes().c[:, self.first_mode :]
+        return np.concatenate([ends, modal_sum(values[:, :, None, :], modes)], axis=2)
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
@@ -214,20 +266,7 @@ class FreeTorque(FreeCurve):
 
 
 @dataclass(frozen=True)
-class FreeTorqueOfState(FreeTorque):
-    """Base: the variable is one that only the replay knows."""
-
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        modes = self.modes_at(self.seen(step, index), *self._bounds)
-        step.joint_torque[:, index] += modal_sum(values, modes)
-
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        """(m, places) the variable at a step."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class FreeTorquePosition(FreeTorqueOfState):
+class FreeTorquePosition(FreeTorque):
     """A torque on a joint that is a smooth function of its position: a spring, a cable, a hose of any form.
 
     Law: the curve at the position at the middle of each step.
@@ -249,12 +288,15 @@ class FreeTorquePosition(FreeTorqueOfState):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return scale.centre - 0.5 * scale.span, scale.centre + 0.5 * scale.span
 
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        return step.qpos[:, index]
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.joint_torque[j] += spline(own[2:], in_range(step.qpos[j], own[0], own[1]))
 
 
 @dataclass(frozen=True)
-class FreeTorqueVelocity(FreeTorqueOfState):
+class FreeTorqueVelocity(FreeTorque):
     """A torque on a joint that is a smooth function of its velocity: friction of any form but sticking.
 
     Law: the curve at the velocity at the middle of each step; slow ones are told apart more finely.
@@ -277,17 +319,19 @@ class FreeTorqueVelocity(FreeTorqueOfState):
         fastest = min(scale.velocity_peak, WIDE * scale.velocity_rms)
         return -fastest, fastest
 
-    @classmethod
-    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
-        share = np.minimum(np.maximum(x / high, -1.0), 1.0) / CREEP
-        return np.asarray(0.5 + 0.5 * np.arcsinh(share) / np.arcsinh(1.0 / CREEP))
+    @staticmethod
+    def position_in(x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        return np.asarray(in_velocities(x, high))
 
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        return step.qvel[:, index]
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.joint_torque[j] += spline(own[2:], in_velocities(step.qvel[j], own[1]))
 
 
 @dataclass(frozen=True)
-class FreeTorqueLoad(FreeTorqueOfState):
+class FreeTorqueLoad(FreeTorque):
     """A torque on a joint that is a smooth function of its drive's torque, which gives more or less than it says.
 
     Law: the curve at the drive's torque at the middle of each step.
@@ -311,12 +355,15 @@ class FreeTorqueLoad(FreeTorqueOfState):
         largest = min(scale.torque_peak, WIDE * scale.torque_rms)
         return -largest, largest
 
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        return step.drive[:, index]
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.joint_torque[j] += spline(own[2:], in_range(drive(step, j), own[0], own[1]))
 
 
 @dataclass(frozen=True)
-class FreeTorqueCommand(FreeTorqueOfState):
+class FreeTorqueCommand(FreeTorque):
     """A torque on a joint that is a smooth function of its command.
 
     Law: the curve at the command of each step.
@@ -336,8 +383,11 @@ class FreeTorqueCommand(FreeTorqueOfState):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return FreeTorquePosition.range_of(scale)
 
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        return step.command[:, index]
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.joint_torque[j] += spline(own[2:], in_range(step.command[j], own[0], own[1]))
 
 
 @dataclass(frozen=True)
@@ -453,7 +503,8 @@ class FreeGainTime(FreeCurve):
     amount: ClassVar[str] = "change of gain"
     transient: ClassVar[bool] = True
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
-    # the constant is the gain itself
+    first_mode: ClassVar[int] = 1
+    """The constant is the gain itself."""
     kinds: ClassVar[tuple[Kind, ...]] = _kinds(modal_bounds(SPLINES)[1:], 1.0, 0.05, "1")
     includes: ClassVar[tuple[str, ...]] = ("thermal_derating",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
@@ -469,13 +520,11 @@ class FreeGainTime(FreeCurve):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return 0.0, scale.seconds
 
-    @classmethod
-    def modes_at(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
-        return super().modes_at(x, low, high)[..., 1:]
-
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        change = modal_sum(values, self.modes_at(np.full(len(index), step.time), *self._bounds))
-        step.gain[:, index] *= np.maximum(1.0 + change, 0.0)
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.gain[j] *= max(1.0 + spline(own[2:], in_range(step.time, own[0], own[1])), 0.0)
 
 
 def _near_frequency(
@@ -494,7 +543,7 @@ def _near_frequency(
 
 
 @dataclass(frozen=True)
-class FreeFriction(FreeTorqueOfState):
+class FreeFriction(FreeTorque):
     """Base: dry friction whose level is a smooth function of one variable; what is below zero of it is none."""
 
     name: ClassVar[str] = "free_friction"
@@ -505,10 +554,6 @@ class FreeFriction(FreeTorqueOfState):
 
     def curve(self, place: str, values: FloatArray, x: FloatArray) -> FloatArray:
         return np.maximum(super().curve(place, values, x), 0.0)
-
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        modes = self.modes_at(self.seen(step, index), *self._bounds)
-        step.friction[:, index] += np.maximum(modal_sum(values, modes), 0.0)
 
 
 @dataclass(frozen=True)
@@ -530,13 +575,15 @@ class FreeFrictionSpeed(FreeFriction):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return 0.0, min(scale.velocity_peak, WIDE * scale.velocity_rms)
 
-    @classmethod
-    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
-        share = np.minimum(np.abs(x) / high, 1.0) / CREEP
-        return np.asarray(np.arcsinh(share) / np.arcsinh(1.0 / CREEP))
+    @staticmethod
+    def position_in(x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        return np.asarray(in_speeds(x, high))
 
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        return step.qvel[:, index]
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.friction[j] += max(spline(own[2:], in_speeds(step.qvel[j], own[1])), 0.0)
 
 
 @dataclass(frozen=True)
@@ -561,12 +608,15 @@ class FreeFrictionLoad(FreeFriction):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return 0.0, min(scale.torque_peak, WIDE * scale.torque_rms)
 
-    @classmethod
-    def position_in(cls, x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
-        return np.asarray(np.minimum(np.abs(x) / high, 1.0))
+    @staticmethod
+    def position_in(x: FloatArray, low: FloatArray | float, high: FloatArray | float) -> FloatArray:
+        return np.asarray(np.abs(x) / high)
 
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        return step.drive[:, index]
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.friction[j] += max(spline(own[2:], abs(drive(step, j)) / own[1]), 0.0)
 
 
 @dataclass(frozen=True)
@@ -587,8 +637,11 @@ class FreeFrictionPosition(FreeFriction):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return FreeTorquePosition.range_of(scale)
 
-    def seen(self, step: Step, index: IntArray) -> FloatArray:
-        return step.qpos[:, index]
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            own = numbers[p]
+            step.friction[j] += max(spline(own[2:], in_range(step.qpos[j], own[0], own[1])), 0.0)
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import LINK_SUFFIX, Kind, Step
+from sysid_btr.terms.base import LINK_SUFFIX, Kind
 from sysid_btr.terms.effect import DofEffect, Effect, Probe
+from sysid_btr.terms.law import Step, drive
 from sysid_btr.terms.scales import JointScale
 
 if TYPE_CHECKING:
@@ -171,9 +173,11 @@ class StribeckFriction(Effect):
             ]
         )
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        speed = step.qvel[:, index] / values[:, :, 2]
-        step.friction[:, index] += values[:, :, 0] + values[:, :, 1] * np.exp(-np.square(speed))
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            falling = math.exp(-((step.qvel[j] / numbers[p, 2]) ** 2))
+            step.friction[j] += numbers[p, 0] + numbers[p, 1] * falling
 
 
 @dataclass(frozen=True)
@@ -197,8 +201,10 @@ class LoadFriction(Effect):
         ("coulomb_friction", "the same motion under different loads"),
     )
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        step.friction[:, index] += values[:, :, 0] * np.abs(step.drive[:, index])
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            step.friction[j] += numbers[p, 0] * abs(drive(step, j))
 
 
 @dataclass(frozen=True)
@@ -212,9 +218,10 @@ class LoadFrictionLarger(LoadFriction):
     variant: ClassVar[str] = "larger"
     label: ClassVar[str] = "load_friction.larger"
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        entering = np.maximum(np.abs(step.drive[:, index]), np.abs(step.load[:, index]))
-        step.friction[:, index] += values[:, :, 0] * entering
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            step.friction[j] += numbers[p, 0] * max(abs(drive(step, j)), abs(step.load[j]))
 
 
 @dataclass(frozen=True)
@@ -231,8 +238,10 @@ class LoadFrictionQuadratic(LoadFriction):
         size = 1 / scale.counter_peak
         return (Kind("curvature", "1/Nm", 0.0, 0.0, 2 * size, 0.1 * size),)
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        step.friction[:, index] += values[:, :, 0] * np.square(step.drive[:, index])
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            step.friction[j] += numbers[p, 0] * drive(step, j) ** 2
 
 
 @dataclass(frozen=True)
@@ -262,6 +271,8 @@ class LoadFrictionStribeck(LoadFriction):
         speed = cls.sized(scale)[2].nominal
         return tuple(((0.1, 0.0, f * speed), (0.0, 0.1, f * speed)) for f in (0.3, 1.0, 3.0))
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        falling = np.exp(-np.square(step.qvel[:, index] / values[:, :, 2]))
-        step.friction[:, index] += np.abs(step.drive[:, index]) * (values[:, :, 0] + values[:, :, 1] * falling)
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            falling = math.exp(-((step.qvel[j] / numbers[p, 2]) ** 2))
+            step.friction[j] += abs(drive(step, j)) * (numbers[p, 0] + numbers[p, 1] * falling)

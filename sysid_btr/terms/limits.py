@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Fields, Kind, Step
+from sysid_btr.terms.base import BatchModel, Fields, Kind
 from sysid_btr.terms.drives import joint_drives
 from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import JointScale
 
 if TYPE_CHECKING:
@@ -100,14 +101,18 @@ class SpeedTorqueLimit(Effect):
         peak, speed = max(scale.torque_peak, 1e-9), max(scale.velocity_peak, 1e-9)
         return tuple(((a * peak, b * speed),) for a in (1.2, 0.8, 0.5) for b in (1.2, 2.5))
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        stall = np.where(values[:, :, 0] >= self.neutral_of(0), np.inf, values[:, :, 0])
-        speed = values[:, :, 1]
-        fraction = step.qvel[:, index] / speed
-        high = stall * np.maximum(1 - np.maximum(fraction, 0), 1e-9)
-        low = -stall * np.maximum(1 + np.minimum(fraction, 0), 1e-9)
-        step.limit_high[:, index] = np.minimum(step.limit_high[:, index], high)
-        step.limit_low[:, index] = np.maximum(step.limit_low[:, index], low)
+    def law_numbers(self, values: FloatArray) -> FloatArray:
+        none = values[:, :, :1] >= self.neutral_of(0)[:, None]
+        return np.concatenate([np.where(none, np.inf, values[:, :, :1]), values[:, :, 1:]], axis=2)
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            stall, fraction = numbers[p, 0], step.qvel[j] / numbers[p, 1]
+            high = stall * max(1 - max(fraction, 0.0), 1e-9)
+            low = -stall * max(1 + min(fraction, 0.0), 1e-9)
+            step.limit_high[j] = min(step.limit_high[j], high)
+            step.limit_low[j] = max(step.limit_low[j], low)
 
 
 @dataclass(frozen=True)

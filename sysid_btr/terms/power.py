@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
-
-import numpy as np
+from typing import ClassVar
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Step, Term
+from sysid_btr.terms.base import Kind, Term
 from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import JointScale
 
 
@@ -35,8 +34,11 @@ class VoltageSag(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((0.004,),),)
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        step.gain *= np.clip(1 - values[:, 0, :1] * step.time, 0.05, 1.0)
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        left = min(max(1 - numbers[0, 0] * step.time, 0.05), 1.0)
+        for j in places:
+            step.gain[j] *= left
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,13 @@ class VoltageSagLoad(VoltageSag):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((cls.sized(scale)[0].scale,),),)
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        total = np.abs(step.torque).sum(axis=1, keepdims=True)
-        step.gain /= 1 + values[:, 0, :1] * total
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        total = 0.0
+        for j in places:
+            total += abs(step.torque[j])
+        for j in places:
+            step.gain[j] /= 1 + numbers[0, 0] * total
 
 
 @dataclass(frozen=True)
@@ -75,11 +81,11 @@ class Switch(Term):
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     switches: ClassVar[bool] = True
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        for joint, column in zip(self.places, index, strict=True):
-            on = step.inputs[f"enabled.{joint}"]
-            step.gain[:, column] *= on
-            step.motor_torque[:, column] *= on
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for j in places:
+            step.gain[j] *= step.enabled[j]
+            step.motor_torque[j] *= step.enabled[j]
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ class ThermalDerating(Effect):
     title: ClassVar[str] = "loss of torque with heat"
     scope: ClassVar = "drive"
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
+    law_memory: ClassVar[int] = 1
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("alpha", "1/Nm2", 0.0, 0.0, 10.0, 0.1),
         Kind("tau", "s", 10.0, 1.0, 200.0, 5.0),
@@ -113,11 +120,10 @@ class ThermalDerating(Effect):
         alpha = cls.sized(scale)[0].scale
         return tuple(((alpha, tau),) for tau in (5.0, 20.0))
 
-    def start_law(self, batch: BatchModel, values: FloatArray) -> FloatArray:
-        return np.zeros(values.shape[:2])
-
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        gain = 1 / (1 + values[:, :, 0] * memory)
-        step.gain[:, index] *= gain
-        torque = gain * step.torque[:, index]
-        memory += step.timestep / values[:, :, 1] * (torque**2 - memory)
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            heat = memory[p, 0]
+            gain = 1 / (1 + numbers[p, 0] * heat)
+            step.gain[j] *= gain
+            memory[p, 0] = heat + step.timestep / numbers[p, 1] * ((gain * step.torque[j]) ** 2 - heat)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope, Step
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope
 from sysid_btr.terms.drives import joint_drives
 from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import JointScale
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ class IntegralGain(Effect):
     title: ClassVar[str] = "integral action of the servo"
     scope: ClassVar = "servo"
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
+    law_memory: ClassVar[int] = 1
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("ki", "Nm/(rad s)", 0.0, 0.0, 200.0, 1.0),)
     everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("joint_spring", "long holds"), ("payload", "long holds"))
@@ -126,14 +128,13 @@ class IntegralGain(Effect):
         size = scale.torque_rms / (0.02 * max(scale.span, 1e-9))
         return (Kind("ki", "Nm/(rad s)", 0.0, 0.0, 10 * size, 0.1 * size),)
 
-    def start_law(self, batch: BatchModel, values: FloatArray) -> FloatArray:
-        return np.zeros(values.shape[:2])
-
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        error = step.command[:, index] - step.qpos[:, index]
-        # the integral at the middle of the step
-        step.motor_torque[:, index] += values[:, :, 0] * (memory + 0.5 * step.timestep * error)
-        memory += step.timestep * error
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            error = step.command[j] - step.qpos[j]
+            # the integral at the middle of the step
+            step.motor_torque[j] += numbers[p, 0] * (memory[p, 0] + 0.5 * step.timestep * error)
+            memory[p, 0] += step.timestep * error
 
 
 @dataclass(frozen=True)
@@ -164,13 +165,13 @@ class BackEmf(Effect):
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         return (Kind("b", "Nm s/rad", 0.0, 0.0, 5 * scale.damping, 0.1 * scale.damping),)
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        for place, column in enumerate(index):
-            on = step.inputs.get(f"enabled.{self.places[place]}", np.float64(1.0))
-            change = values[:, place, 0] * step.qvel[:, column] * on
-            step.motor_torque[:, column] -= change
-            step.limit_low[:, column] -= change
-            step.limit_high[:, column] -= change
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            change = numbers[p, 0] * step.qvel[j] * step.enabled[j]
+            step.motor_torque[j] -= change
+            step.limit_low[j] -= change
+            step.limit_high[j] -= change
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import LINK_SUFFIX, BatchModel, Fields, Kind, Step
+from sysid_btr.terms.base import LINK_SUFFIX, BatchModel, Fields, Kind
 from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import JointScale
 from sysid_btr.terms.waves import nearby_waves
 
@@ -234,6 +236,8 @@ class Cogging(Effect):
     def initial_guesses(cls, values: FloatArray) -> FloatArray:
         return nearby_waves(values)
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        phase = values[:, :, 2] * step.qpos[:, index]
-        step.joint_torque[:, index] += values[:, :, 0] * np.sin(phase) + values[:, :, 1] * np.cos(phase)
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            phase = numbers[p, 2] * step.qpos[j]
+            step.joint_torque[j] += numbers[p, 0] * math.sin(phase) + numbers[p, 1] * math.cos(phase)

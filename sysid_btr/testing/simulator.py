@@ -14,7 +14,8 @@ from sysid_btr.simulation.mujoco_batch import MujocoBatch
 from sysid_btr.simulation.setup import Law, Setup
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.simulation.simulator import Simulator, States
-from sysid_btr.terms.base import BatchModel, Fields, Kind, Step, Term
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Term
+from sysid_btr.terms.law import Step, drive
 from sysid_btr.testing.require import require
 
 MASS, STEP, STEPS = 2.0, 0.01, 40
@@ -55,13 +56,13 @@ class _Push(Term):
     name: ClassVar[str] = "push"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("rate", "N/step", 0.0, -10.0, 10.0, 1.0),)
     law_acts: ClassVar[tuple[str, ...]] = ()
+    law_memory: ClassVar[int] = 1
 
-    def start_law(self, batch: BatchModel, values: FloatArray) -> FloatArray:
-        return np.zeros(values.shape[:2])
-
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        memory += values[:, :, 0]
-        step.joint_torque[:, index] += memory
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            memory[p, 0] += numbers[p, 0]
+            step.joint_torque[j] += memory[p, 0]
 
 
 @dataclass(frozen=True)
@@ -71,12 +72,14 @@ class _Tired(Term):
     name: ClassVar[str] = "tired"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("size", "1", 0.0, 0.0, 1.0, 0.1),)
 
-    def law(self, step: Step, values: FloatArray, memory: Any, index: IntArray) -> None:
-        size = values[:, :, 0]
-        step.gain[:, index] *= 1 - 0.5 * size
-        step.motor_torque[:, index] += 0.3 * size * step.inputs["voltage.arm"][:, None]
-        step.limit_high[:, index] = np.minimum(step.limit_high[:, index], 4 - 2 * size)
-        step.friction[:, index] += size * np.abs(0.1 * step.load[:, index] + 0.05 * step.drive[:, index])
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            size = numbers[p, 0]
+            step.gain[j] *= 1 - 0.5 * size
+            step.motor_torque[j] += 0.3 * size * step.voltage[j]
+            step.limit_high[j] = min(step.limit_high[j], 4 - 2 * size)
+            step.friction[j] += size * abs(0.1 * step.load[j] + 0.05 * drive(step, j))
 
 
 def check_simulator(simulator: Simulator) -> None:
@@ -267,7 +270,7 @@ def _under_laws(size: int, integrator: str = "RK4") -> Setup:
     sizes = np.linspace(0.2, 0.8, size)[:, None, None] * np.ones((1, 2, 1))
     voltage = np.sin(0.2 * np.arange(STEPS))[:, None] * np.ones((1, size))
     laws = (Law(_Tired(("shoulder", "elbow")), sizes, np.arange(2)),)
-    return replace(_arm(size, integrator), laws=laws, inputs={"voltage.arm": voltage})
+    return replace(_arm(size, integrator), laws=laws, inputs={"voltage.shoulder": voltage, "voltage.elbow": voltage})
 
 
 def _rows(setup: Setup, rows: slice) -> Setup:

@@ -1,0 +1,171 @@
+"""Laws of terms as machine code: compiled once, kept beside their source, and called between steps without Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cache
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core.errors import NumbaError
+from numba.extending import intrinsic, register_jitable
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.errors import UsageError
+from sysid_btr.simulation.setup import Law
+from sysid_btr.terms import law as terms_law
+
+_ROW = types.float64[::1]
+_STEP = types.NamedTuple([types.float64, types.float64, *[_ROW] * terms_law.ROWS], terms_law.Step)
+SIGNATURE = types.void(_STEP, types.float64[:, ::1], types.float64[:, ::1], types.int64[::1])
+
+
+class Laws(NamedTuple):
+    """The laws (n,) of a setup, in the order in which they act.
+
+    Attributes
+    ----------
+    address : of the machine code of each.
+    rows, width, kept : its numbers are (rows, width), its memory (rows, kept).
+    number, memory, place : (n + 1,) where its own begin in what is laid end to end.
+    places : positions among the joints, law after law.
+    """
+
+    address: IntArray
+    rows: IntArray
+    width: IntArray
+    kept: IntArray
+    number: IntArray
+    memory: IntArray
+    place: IntArray
+    places: IntArray
+
+
+def table_of(laws: Sequence[Law], candidates: int) -> tuple[Laws, FloatArray]:
+    """Laws and, for each candidate, their numbers (candidates, n) end to end."""
+    numbers = [law.term.law_numbers(law.values) for law in laws]
+    rows, width = ([n.shape[axis] for n in numbers] for axis in (1, 2))
+    kept, places = [law.term.law_memory for law in laws], [law.places for law in laws]
+    table = Laws(
+        _whole([address_of(law.term.law) for law in laws]),
+        _whole(rows),
+        _whole(width),
+        _whole(kept),
+        _ends(np.multiply(rows, width)),
+        _ends(np.multiply(rows, kept)),
+        _ends([len(p) for p in places]),
+        _whole(np.concatenate([np.zeros(0), *places])),
+    )
+    return table, np.concatenate([np.zeros((candidates, 0)), *(n.reshape(candidates, -1) for n in numbers)], axis=1)
+
+
+def _whole(values: Any) -> IntArray:
+    return np.asarray(values, dtype=np.int64)
+
+
+def _ends(counts: Any) -> IntArray:
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(_whole(counts))])
+
+
+@cache
+def address_of(law: Callable[..., None]) -> int:
+    """Where the machine code of a law is.
+
+    Raises
+    ------
+    UsageError
+        The law is not in the Python that numba compiles.
+    """
+    _register_used(law)
+    compiled = numba.njit(nogil=True, error_model="numpy")(law)
+    try:
+        with suppress(RuntimeError):  # one without a file is compiled again in each process
+            compiled.enable_caching()
+        compiled.compile(SIGNATURE)
+    except NumbaError as error:
+        raise UsageError(
+            f"{law.__module__}.{law.__qualname__} cannot be compiled: {str(error).strip()}\n"
+            "A law acts on the numbers of one candidate, in the Python that numba compiles: numbers, arrays, math"
+        ) from error
+    found = compiled.overloads[SIGNATURE.args]
+    return int(found.library.get_pointer_to_function(found.fndesc.llvm_cfunc_wrapper_name))
+
+
+@cache
+def _register_used(function: Any) -> None:
+    """Let compiled code call the plain functions that a function calls."""
+    for name in function.__code__.co_names:
+        used = function.__globals__.get(name)
+        if getattr(used, "used_in_laws", False):
+            _register_used(used)
+            register_jitable(used)
+
+
+def _call_law(typing: Any, address: Any, step: Any, numbers: Any, memory: Any, places: Any) -> Any:
+    """Call a law by its address."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kinds = [context.get_value_type(kind) for kind in signature.args[1:]]
+        code = builder.inttoptr(values[0], ir.FunctionType(context.get_value_type(types.none), kinds).as_pointer())
+        builder.call(code, values[1:])
+        return context.get_dummy_value()
+
+    return types.void(address, step, numbers, memory, places), generate
+
+
+call_law = intrinsic(_call_law)
+
+
+def _apply(laws: Laws, numbers: FloatArray, memory: FloatArray, step: terms_law.Step) -> None:
+    """Let all laws act on a step of one candidate, whose numbers and memory they are."""
+    for n in range(len(laws.address)):
+        rows = laws.rows[n]
+        own = numbers[laws.number[n] : laws.number[n + 1]].reshape(rows, laws.width[n])
+        kept = memory[laws.memory[n] : laws.memory[n + 1]].reshape(rows, laws.kept[n])
+        call_law(laws.address[n], step, own, kept, laws.places[laws.place[n] : laws.place[n + 1]])
+
+
+apply_laws = numba.njit(cache=True, nogil=True, error_model="numpy")(_apply)
+
+
+def _on_samples(
+    laws: Laws,
+    numbers: FloatArray,
+    period: float,
+    position: FloatArray,
+    velocity: FloatArray,
+    torque: FloatArray,
+    load: FloatArray,
+    friction: FloatArray,
+    joint_torque: FloatArray,
+) -> None:
+    """Let laws without memory act on samples (n, j) of a motion, and add what they do to the last two."""
+    none, ones = np.full(position.shape[1], np.nan), np.ones(position.shape[1])
+    memory = np.zeros(0)
+    for i in range(len(position)):
+        gain, motor, low, high = ones.copy(), 0 * ones, -np.inf * ones, np.inf * ones
+        step = terms_law.Step(
+            0.0,
+            period,
+            position[i],
+            position[i],
+            velocity[i],
+            torque[i],
+            load[i],
+            none,
+            ones,
+            gain,
+            motor,
+            joint_torque[i],
+            friction[i],
+            low,
+            high,
+        )
+        apply_laws(laws, numbers, memory, step)
+
+
+on_samples = numba.njit(cache=True, nogil=True, error_model="numpy")(_on_samples)

@@ -1,0 +1,180 @@
+"""MuJoCo step by step on threads, with laws between the steps, all of it in compiled code."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.simulation.setup import Setup
+from sysid_btr.simulation.silence import mujoco_library
+from sysid_btr.simulation.simulator import States
+from sysid_btr.simulation.stepping import (
+    STATE,
+    Candidates,
+    Engine,
+    Plan,
+    act,
+    begin,
+    given_torque,
+    gives_effort,
+    plan_of,
+    written,
+)
+from sysid_btr.terms.base import Fields
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+class Calls(NamedTuple):
+    """Addresses of MuJoCo's functions, and of a model and data of a thread's own."""
+
+    reset: int
+    step: int
+    model: int
+    data: int
+
+
+class Copies(NamedTuple):
+    """What is copied before a candidate's rollout: where to, from where, and bytes of each row, (n,)."""
+
+    target: IntArray
+    source: IntArray
+    size: IntArray
+
+
+class Thread(NamedTuple):
+    """What a thread simulates with; `warnings` are MuJoCo's counts."""
+
+    calls: Calls
+    copies: Copies
+    engine: Engine
+    warnings: Any
+
+
+class Kept(NamedTuple):
+    """What is kept of candidates: states (m, k, ...) at borders (k,), torques (m, k, j) or none; who failed, (m,)."""
+
+    borders: IntArray
+    qpos: FloatArray
+    qvel: FloatArray
+    effort: FloatArray
+    failed: Any
+
+
+def roll_out(setup: Setup, fields: Fields, borders: IntArray, threads: int) -> States:
+    """Roll out on a number of threads, 0 for all cores; `fields` are those in which candidates differ."""
+    plan, own = plan_of(setup)
+    m, k, model = setup.size, len(borders), setup.model
+    states = States.empty(m, k, setup.index, effort=gives_effort(setup))
+    qpos, qvel = (np.full((m, k, size), np.nan) for size in (model.nq, model.nv))
+    effort = np.empty((0, 0, 0)) if states.effort is None else states.effort
+    kept = Kept(np.asarray(borders, dtype=np.int64), qpos, qvel, effort, np.zeros(m, dtype=np.bool_))
+    rows = {name: setup.batch.read(name) for name in written(setup)} | fields
+    count = min(threads or len(os.sched_getaffinity(0)), m)
+    stop = np.zeros(1, dtype=np.int64)
+    with ThreadPoolExecutor(count) as pool:
+        try:
+            owned = list(threads_of(model, rows, setup.state, count))
+            jobs = [
+                pool.submit(roll, m * t // count, m * (t + 1) // count, plan, own, thread, kept, stop)
+                for t, (thread, _) in enumerate(owned)
+            ]
+            for job in jobs:
+                job.result()
+        finally:
+            stop[0] = 1
+    states.put(setup.index, np.arange(k), qpos, qvel)
+    states.repeat_last_effort()
+    states.failed = kept.failed
+    return states
+
+
+def threads_of(model: mujoco.MjModel, fields: Fields, state: Fields, count: int) -> Iterator[tuple[Thread, Any]]:
+    """What each thread simulates with, and the objects that own it."""
+    import mujoco
+
+    library = mujoco_library()
+    reset, step = (ctypes.cast(getattr(library, f"mj_{n}"), ctypes.c_void_p).value for n in ("resetData", "step"))
+    assert reset is not None
+    assert step is not None
+    for _ in range(count):
+        own = copy(model)
+        # a candidate that diverges is seen by its warnings: MuJoCo's reset would hide its states
+        own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        data = mujoco.MjData(own)
+        rows = [(own.opt if n.startswith("opt.") else own, n.removeprefix("opt."), v) for n, v in fields.items()]
+        rows += [(data, n, v) for n, v in state.items()]
+        targets: list[Any] = [getattr(owner, name) for owner, name, _ in rows]
+        sources = [np.ascontiguousarray(v, dtype=target.dtype) for (_, _, v), target in zip(rows, targets, strict=True)]
+        at, start = (np.array([a.ctypes.data for a in arrays], dtype=np.int64) for arrays in (targets, sources))
+        copies = Copies(at, start, np.array([a.nbytes for a in targets], dtype=np.int64))
+        engine = Engine(*(getattr(data if name in STATE else own, name) for name in Engine._fields))
+        calls = Calls(reset, step, own._address, data._address)
+        yield Thread(calls, copies, engine, data.warning.number), (own, data, targets, sources)
+
+
+def _pointer(typing: Any, address: Any) -> Any:
+    """An address as a pointer to bytes."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(types.uint8)(address), generate
+
+
+def _call(typing: Any, address: Any, one: Any, other: Any) -> Any:
+    """Call a C function of two pointers, all by their addresses."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [values[1].type, values[2].type])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), values[1:])
+        return context.get_dummy_value()
+
+    return types.void(address, one, other), generate
+
+
+pointer, call = intrinsic(_pointer), intrinsic(_call)
+
+
+def _roll(first: int, last: int, plan: Plan, own: Candidates, thread: Thread, kept: Kept, stop: IntArray) -> None:
+    """Roll out the candidates from `first` to before `last`, unless told to stop."""
+    calls, copies, engine = thread.calls, thread.copies, thread.engine
+    for i in range(first, last):
+        if stop[0]:
+            return
+        call(calls.reset, calls.model, calls.data)
+        for c in range(len(copies.size)):
+            size = copies.size[c]
+            target = numba.carray(pointer(copies.target[c]), (size,))
+            target[:] = numba.carray(pointer(copies.source[c] + i * size), (size,))
+        memory, slot = begin(i, plan, own, engine), 0
+        for k in range(plan.steps + 1):
+            wanted = slot < len(kept.borders) and kept.borders[slot] == k
+            if wanted:
+                kept.qpos[i, slot], kept.qvel[i, slot] = engine.qpos, engine.qvel
+            if k == plan.steps:
+                break
+            act(k, i, plan, own, engine, memory)
+            if wanted:
+                if kept.effort.size:
+                    given_torque(i, plan, own, memory, kept.effort[i, slot])
+                slot += 1
+            call(calls.step, calls.model, calls.data)
+            if thread.warnings.any():
+                kept.failed[i] = True
+                break
+
+
+roll = numba.njit(cache=True, nogil=True, error_model="numpy")(_roll)
