@@ -1,4 +1,4 @@
-"""Where the CPU time of a run goes: physics, laws, linear algebra, set-up, choosing the step, everything else.
+"""Where the CPU time of a run goes: physics, with laws of every step and without, linear algebra, set-up, and so on.
 
 A thread looks every few milliseconds at the Python stack of the one that works, and gives the CPU time that the process
 has used since to the part of the first rule that fits. Nothing is slowed down, and nothing has to know of it.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ EVERY = 0.005
 STEP = "choosing the step"
 SETUP = "set-up"
 ONE, MANY = "physics of one candidate", "physics"
-LAWS, ALGEBRA, REPORT, REST = "laws", "linear algebra", "report", "else"
+LAWS, ALGEBRA, REPORT, REST = "physics under laws", "linear algebra", "report", "else"
 PARTS = (MANY, ONE, LAWS, ALGEBRA, STEP, SETUP, REPORT, REST)
 
 WHOLE = {
@@ -37,8 +37,6 @@ WHOLE = {
 }
 """Functions whose time is of one part, whatever they call."""
 FOLDERS = (
-    ("sysid_btr/simulation/stepping.py", LAWS),
-    ("sysid_btr/terms/", LAWS),
     ("numpy/linalg/", ALGEBRA),
     ("scipy/linalg/", ALGEBRA),
     ("sysid_btr/floating_base/chain.py", ALGEBRA),
@@ -63,7 +61,7 @@ class Phases:
     seconds : by part.
     steps : of one simulation each, by the name of the integrator; one evaluation of the dynamics without a step counts
         as a step of Euler's method.
-    calls : into the simulator, by the name of its method.
+    calls : into the simulator, by part.
     """
 
     seconds: Counter[str] = field(default_factory=Counter)
@@ -73,7 +71,7 @@ class Phases:
     @property
     def physics(self) -> float:
         """CPU seconds inside MuJoCo."""
-        return self.seconds[ONE] + self.seconds[MANY]
+        return self.seconds[ONE] + self.seconds[MANY] + self.seconds[LAWS]
 
     def to_dict(self) -> dict[str, float]:
         """Shares of all CPU time."""
@@ -105,31 +103,32 @@ def watched() -> Iterator[Phases]:
 
 @contextmanager
 def _counting(found: Phases) -> Iterator[None]:
-    """Count the steps of every simulation, by wrapping the simulator's methods."""
+    """Count the steps of every simulation, by wrapping the ways into MuJoCo."""
     from mujoco import mjtIntegrator
     from mujoco.batch import Batch
 
+    from sysid_btr.simulation.mujoco_batch import MujocoBatch
+
     integrators = {getattr(mjtIntegrator, f"mjINT_{name.upper()}").value: name for name in INTEGRATORS}
+    rollout, forward = MujocoBatch.rollout, Batch.forward
 
-    def counted(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-        def physics(batch: Any, *args: Any, **options: Any) -> Any:
-            found.calls[name] += 1
-            if name != "set_const":
-                rows = int(args[0]) if name == "rollout" else 1
-                integrator = "Euler" if name == "forward" else integrators[batch.model.opt.integrator]
-                found.steps[integrator] += rows * int(batch.nsim)
-            return method(batch, *args, **options)
+    def physics(simulator: MujocoBatch, setup: Any, *args: Any, **options: Any) -> Any:
+        part = LAWS if setup.laws or setup.held_steps else ONE if setup.size == 1 else MANY
+        found.calls[part] += 1
+        found.steps[integrators[setup.model.opt.integrator]] += setup.steps * setup.size
+        return rollout(simulator, setup, *args, **options)
 
-        return physics
+    def evaluation(batch: Any, *args: Any, **options: Any) -> Any:
+        part = ONE if batch.nsim == 1 else MANY
+        found.calls[part] += 1
+        found.steps["Euler"] += int(batch.nsim)
+        return forward(batch, *args, **options)
 
-    own = {name: getattr(Batch, name) for name in ("rollout", "step", "forward", "set_const")}
-    for name, method in own.items():
-        setattr(Batch, name, counted(name, method))
+    MujocoBatch.rollout, Batch.forward = physics, evaluation  # type: ignore[method-assign]
     try:
         yield
     finally:
-        for name, method in own.items():
-            setattr(Batch, name, method)
+        MujocoBatch.rollout, Batch.forward = rollout, forward  # type: ignore[method-assign]
 
 
 def _part_of(frame: FrameType | None) -> str:
@@ -143,8 +142,8 @@ def _part_of(frame: FrameType | None) -> str:
             return whole
     for inner in stack:
         code = inner.f_code
-        if code.co_name == "physics" and code.co_filename == __file__:
-            return ONE if int(inner.f_locals["batch"].nsim) == 1 else MANY
+        if code.co_name in ("physics", "evaluation") and code.co_filename == __file__:
+            return str(inner.f_locals["part"])
         place = Path(code.co_filename).as_posix()
         for beginning, part in FOLDERS:
             if beginning in place:
