@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,9 +24,11 @@ EVERY = 0.005
 STEP = "choosing the step"
 SETUP = "set-up"
 ONE, MANY = "physics of one candidate", "physics"
-LAWS, ALGEBRA, REPORT, REST = "physics under laws", "linear algebra", "report", "else"
-PARTS = (MANY, ONE, LAWS, ALGEBRA, STEP, SETUP, REPORT, REST)
+LAWS, COMPILED = "physics under laws", "compiling laws"
+ALGEBRA, REPORT, REST = "linear algebra", "report", "else"
+PARTS = (MANY, ONE, LAWS, COMPILED, ALGEBRA, STEP, SETUP, REPORT, REST)
 
+COMPILER = "/numba/core/"
 WHOLE = {
     "choose_numerics": STEP,
     "realise_servo": STEP,
@@ -88,7 +90,10 @@ def watched() -> Iterator[Phases]:
         before = process_time()
         while not done.wait(EVERY):
             now = process_time()
-            found.seconds[_part_of(sys._current_frames().get(watching))] += now - before
+            stacks = {name: _stack(frame) for name, frame in sys._current_frames().items()}
+            # laws are compiled by the thread that is the first to run them
+            compiles = any(COMPILER in frame.f_code.co_filename for stack in stacks.values() for frame in stack)
+            found.seconds[COMPILED if compiles else _part_of(stacks.get(watching, []))] += now - before
             before = now
 
     thread = threading.Thread(target=look, daemon=True)
@@ -131,12 +136,17 @@ def _counting(found: Phases) -> Iterator[None]:
         MujocoBatch.rollout, Batch.forward = rollout, forward  # type: ignore[method-assign]
 
 
-def _part_of(frame: FrameType | None) -> str:
-    """The part that a stack, from its innermost frame on, belongs to."""
-    stack = []
+def _stack(frame: FrameType | None) -> list[FrameType]:
+    """Frames from the innermost one on."""
+    found = []
     while frame is not None:
-        stack.append(frame)
+        found.append(frame)
         frame = frame.f_back
+    return found
+
+
+def _part_of(stack: Sequence[FrameType]) -> str:
+    """The part that a stack, from its innermost frame on, belongs to."""
     for outer in reversed(stack):
         if (whole := WHOLE.get(outer.f_code.co_name)) is not None:
             return whole
