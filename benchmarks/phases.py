@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -66,7 +66,7 @@ class Phases:
     calls : into the simulator, by part.
     """
 
-    seconds: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     steps: Counter[str] = field(default_factory=Counter)
     calls: Counter[str] = field(default_factory=Counter)
 
@@ -129,11 +129,14 @@ def _counting(found: Phases) -> Iterator[None]:
         found.steps["Euler"] += int(batch.nsim)
         return forward(batch, *args, **options)
 
-    MujocoBatch.rollout, Batch.forward = physics, evaluation  # type: ignore[method-assign]
+    ways = ((MujocoBatch, "rollout", physics, rollout), (Batch, "forward", evaluation, forward))
+    for owner, name, watching, _ in ways:
+        setattr(owner, name, watching)
     try:
         yield
     finally:
-        MujocoBatch.rollout, Batch.forward = rollout, forward  # type: ignore[method-assign]
+        for owner, name, _, own in ways:
+            setattr(owner, name, own)
 
 
 def _stack(frame: FrameType | None) -> list[FrameType]:

@@ -134,7 +134,8 @@ class Heard(io.TextIOBase):
     """stderr, which remembers when the first line of progress came."""
 
     def __init__(self, began: float) -> None:
-        self.began, self.first = began, {}
+        self.began = began
+        self.first: dict[str, Any] = {}
 
     def write(self, text: str) -> int:
         if not self.first and " replays, " in text:

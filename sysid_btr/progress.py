@@ -71,11 +71,11 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
 
 
-def mention(note: str) -> None:
-    """Say what is done, on the line that is shown, if any: for long work that no search reports."""
+def mention(note: str, done: float) -> None:
+    """Say what is done and which fraction of the phase, on the line that is shown, if any: where no search reports."""
     line = _SHOWN.get()
     if line is not None:
-        line.mention(note)
+        line.mention(note, done)
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,10 @@ class ProgressLine:
             self._spans.pop()
             self._finished, self._reports = end, 0
 
-    def mention(self, note: str) -> None:
+    def mention(self, note: str, done: float) -> None:
         """See `progress.mention`."""
-        self(done=self._last, total=None, best=math.nan, note=note)
+        self._advance(done)
+        self._show((), note, LINE_EVERY)
 
     def __call__(self, *, done: int, total: int | None, best: float, note: str) -> None:
         """Report; the contract of `sysid_btr.estimators.base.Progress`."""
@@ -150,11 +151,14 @@ class ProgressLine:
         self._last = done
         self._reports += 1
         self.best = best if math.isfinite(best) else self.best
-        inner = done / total if total else self._reports / (self._reports + USUAL_REPORTS)
-        span = self._spans[-1]
         if total or len(self._spans) > 1:
-            self._fraction = max(self._fraction, span.begin + min(inner, 1.0) * (span.end - span.begin))
+            self._advance(done / total if total else self._reports / (self._reports + USUAL_REPORTS))
         self._show(_loss(best), note, LINE_EVERY)
+
+    def _advance(self, done: float) -> None:
+        """Take a fraction of the present phase for done."""
+        span = self._spans[-1]
+        self._fraction = max(self._fraction, span.begin + min(done, 1.0) * (span.end - span.begin))
 
     def _show(self, loss: tuple[str, ...], note: str, every: float) -> None:
         count, elapsed = self._before + self._last, time.monotonic() - self._begun

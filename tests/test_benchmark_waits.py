@@ -30,7 +30,7 @@ def test_steps_are_counted_with_laws_and_without() -> None:
 def test_time_goes_to_the_part_that_spends_it() -> None:
     matrix = np.random.default_rng(0).normal(size=(300, 300))
     with watched() as phases:
-        while phases.seconds.total() < 0.2:
+        while sum(phases.seconds.values()) < 0.2:
             np.linalg.svd(matrix)
     assert max(phases.seconds, key=lambda part: phases.seconds[part]) == ALGEBRA
 

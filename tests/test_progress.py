@@ -18,7 +18,7 @@ from toys import make_log, pendulum, run, swing
 from sysid_btr.diagnosis.close import close
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
-from sysid_btr.progress import ProgressLine, phase
+from sysid_btr.progress import ProgressLine, mention, phase
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.grammar import parse_parameters
 
@@ -113,6 +113,19 @@ def test_a_total_that_is_known_says_how_much_of_a_phase_is_done(clock: list[floa
         clock[0] = 40.0
         progress(done=50, total=100, best=math.nan, note="")
     assert stream.getvalue().splitlines()[-1] == "posterior: 40 %, 50 replays, 40 s, about 60 s left, draws"
+
+
+def test_long_work_without_a_search_says_how_far_it_is(clock: list[float]) -> None:
+    stream = io.StringIO()
+    mention("nobody listens", 0.5)
+    with ProgressLine("fit", stream, _begun=clock[0]) as progress:
+        progress(done=0, total=None, best=math.inf, note="reading the motion")
+        with phase("states of the base", 0.4):
+            clock[0] = 30.0
+            mention("round 3 of 4", 0.5)
+    assert stream.getvalue().splitlines()[-1] == (
+        "fit: 20 %, 0 replays, 30 s, about 2 min left, states of the base: round 3 of 4"
+    )
 
 
 def test_a_loss_means_the_same_all_through_a_run() -> None:
