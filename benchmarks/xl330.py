@@ -99,10 +99,12 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
     study = make_study(xl330(), kept, channels=("position",), numerics=Numerics("RK4", SEARCH), threads=1)
     found = close(study, list(DECLARED), effects=effects, progress=tell, selection=Selection(minimum_gain=MINIMUM_GAIN))
     # every log in full, and all alike
-    whole = make_study(xl330(), logs, channels=("position",), numerics=Numerics("RK4", FINAL), threads=1)
+    numerics = Numerics("RK4", FINAL)
+    whole = make_study(xl330(), logs, holdout=logs, channels=("position",), numerics=numerics, threads=1)
     names = [Path(str(log.path)).stem for log in logs]
-    whole = replace(whole, train=tuple(logs), inflation={})
-    fitted = replace(whole, train=tuple(kept))
+    fitted = replace(
+        whole, train=tuple(e for e, name in zip(whole.train, names, strict=True) if not name.startswith(fold))
+    )
     rungs = climb(found, fitted)
     return {
         "verdict": found.verdict,

@@ -315,7 +315,7 @@ def commands_page() -> str:
     from sysid_btr.cli import EXIT_CODES, app
 
     command = typer.main.get_command(app)
-    lines = ["# Commands", "", " ".join(EXIT_CODES.split()), ""]
+    lines = ["# Commands", "", "```text", EXIT_CODES.removeprefix("\b").strip(), "```", ""]
     for name, verb in sorted(command.commands.items()):  # type: ignore[attr-defined]
         context = verb.make_context(f"sysid-btr {name}", [], resilient_parsing=True, terminal_width=100)
         lines += [f"## {name}", "", "```text", verb.get_help(context), "```", ""]

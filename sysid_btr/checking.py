@@ -31,9 +31,10 @@ from sysid_btr.models.robot import Robot, joint_ranges
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.progress import shows_progress, watched
 from sysid_btr.result import clean
+from sysid_btr.terms.base import Parameter
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model, Terms
-from sysid_btr.terms.scales import scale_at
+from sysid_btr.terms.scales import JointScale, scale_at
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,16 +89,26 @@ class EffectCheck:
 
     Attributes
     ----------
-    effect, where, unit : of the effect, and of its amount.
-    shows_from : smallest amount that would show at the odds; None where none within its bounds would.
+    effect, where : of the effect.
+    parameter, unit : which of its numbers `shows_from` is, e.g. the x of an offset; several are tried, and the one that
+        shows best is given.
+    nominal : amount that leaves the model as it is; None for a limit, which does so wherever it is not reached.
+    shows_from : amount nearest to that which would show at the odds; None where none within its bounds would.
     confounded_with : effects at the same place whose traces are nearly the same.
     """
 
     effect: str
     where: str
+    parameter: str
     unit: str
+    nominal: float | None
     shows_from: float | None
     confounded_with: tuple[str, ...]
+
+    @property
+    def size(self) -> float | None:
+        """The smallest change that would show; of a limit, the limit."""
+        return None if self.shows_from is None else abs(self.shows_from - (self.nominal or 0.0))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -212,17 +223,22 @@ def check(
     threads: int = 0,
     progress: Progress = watched,
 ) -> LogCheck:
-    """Say what logs can tell of a robot, before anything is fitted.
+    """Say what logs are informative about, before anything is fitted.
 
     Parameters
     ----------
     robot, logs : model and recordings.
     parameters : expressions of the grammar, as for `fit`.
     effects : names of effects, or ``all``.
-    odds : for an effect against none, at which it is said to show.
+    odds : in favour of an effect, from which it counts as visible.
     budget : s, after which no further effects are tried.
     threads : worker threads, 0 for all cores.
     progress : is told what is going on.
+
+    Returns
+    -------
+    LogCheck
+        Joints, parameters, effects, problems, and advice; its tables by ``to_pandas``.
 
     Raises
     ------
@@ -273,7 +289,7 @@ class _Trace:
     effect: type[Effect]
     place: str
     amount: float
-    bounds: tuple[float, float, float]
+    kind: Parameter
     size: float
     direction: FloatArray
 
@@ -315,17 +331,20 @@ def _traces(
             continue
         change = change - basis @ (basis.T @ change)
         size = float(np.linalg.norm(change))
-        kind = term.parameters[k * width + effect.main]
+        varied = _varied(effect, probe, scale_at(study.scales, place))
+        kind = replace(term.parameters[k * width + varied], name=effect.kinds[varied].name)
         few = change[:: max(len(change) // KEPT, 1)]
         norm = float(np.linalg.norm(few))
-        yield _Trace(
-            effect,
-            place,
-            float(probe[effect.main]),
-            (kind.nominal, kind.lower, kind.upper),
-            size,
-            few / norm if norm > 0 else few,
-        )
+        yield _Trace(effect, place, float(probe[varied]), kind, size, few / norm if norm > 0 else few)
+
+
+def _varied(effect: type[Effect], probe: Sequence[float], scale: JointScale) -> int:
+    """Which of an effect's numbers says how large a probe is: its main one, or that which is changed in its place."""
+    changes = [
+        0.0 if kind.name in effect.held else abs(value - kind.nominal) / kind.scale
+        for kind, value in zip(effect.sized(scale), probe, strict=True)
+    ]
+    return effect.main if effect.is_threshold() or changes[effect.main] > 0 else int(np.argmax(changes))
 
 
 def _judged(traces: Sequence[_Trace], threshold: float) -> Iterator[EffectCheck]:
@@ -347,20 +366,28 @@ def _judged(traces: Sequence[_Trace], threshold: float) -> Iterator[EffectCheck]
             and len(rival.direction) == len(trace.direction)
             and abs(float(rival.direction @ trace.direction)) > level
         ]
-        unit = trace.effect.kinds[trace.effect.main].unit
         alike = tuple(others) if shown[name, place] is not None else ()
-        yield EffectCheck(name, place, unit, shown[name, place], alike)
+        nominal = None if trace.effect.is_threshold() else trace.kind.nominal
+        yield EffectCheck(
+            effect=name,
+            where=place,
+            parameter=trace.kind.name,
+            unit=trace.kind.unit,
+            nominal=nominal,
+            shows_from=shown[name, place],
+            confounded_with=alike,
+        )
 
 
 def _shows_from(trace: _Trace, threshold: float) -> float | None:
     """Smallest amount that would show, on the side of the probe; for a limit the probe itself, or nothing."""
-    nominal, lower, upper = trace.bounds
-    if trace.effect.held and trace.effect.kinds[trace.effect.main].name in trace.effect.held:
+    if trace.effect.is_threshold():
         return trace.amount if trace.size**2 >= threshold else None
     if trace.size == 0:
         return None
-    amount = nominal + (trace.amount - nominal) * math.sqrt(threshold) / trace.size
-    return amount if lower <= amount <= upper else None
+    kind = trace.kind
+    amount = kind.nominal + (trace.amount - kind.nominal) * math.sqrt(threshold) / trace.size
+    return amount if kind.lower <= amount <= kind.upper else None
 
 
 # --- joints ------------------------------------------------------------------------------------------------------

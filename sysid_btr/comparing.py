@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.display.comparison import BECAME
 from sysid_btr.errors import UsageError
 from sysid_btr.result import clean, read_result
 
@@ -148,7 +149,7 @@ class Comparison:
             else "no difference could be tested"
         ]
         parts += [f"{', '.join(drifting)} drift with time"] if drifting else []
-        changed = [f"{e.effect} at {e.where} {e.became}" for e in self.effects if e.became != "stayed"]
+        changed = [f"{e.effect} at {e.where} is {BECAME[e.became]}" for e in self.effects if e.became != "stayed"]
         return "; ".join([*parts, *changed]) + "."
 
     def to_dict(self) -> dict[str, Any]:
@@ -215,6 +216,11 @@ def compare(
     robot : model for that; default the one the runs name.
     dates : ISO 8601, one a run; default when its first fitted log was recorded, if the log says so.
     threads : worker threads for `logs`, 0 for all cores.
+
+    Returns
+    -------
+    Comparison
+        Parameters, effects and errors side by side, and remarks on what makes the runs less comparable.
 
     Raises
     ------
@@ -307,7 +313,7 @@ def _check_models(runs: Sequence[Run]) -> Iterator[str]:
     for run in runs:
         more = [name for name in run.parameters if name not in common and ":" in name]
         if more:
-            yield f"only in some of the runs, among them {run.label}: {', '.join(more)}"
+            yield f"{run.label} has parameters that not all runs have: {', '.join(more)}"
         if run.result.get("converged") is False:
             yield f"{run.label} did not converge"
 

@@ -43,7 +43,7 @@ def import_log(
     mapping : mapping file (TOML), on top of the preset; `sysid_btr.io.importers.mapping` describes it.
     units : channel or column -> unit, as ``--unit``; wins over the mapping.
     rename : joint of the file -> joint of the model, as ``--rename``.
-    mount : whether the torso was held or could move.
+    mount : whether the base was fixed or free to move.
     importer : name of an importer, one of one's own, or ``"auto"`` to judge by the content.
 
     Returns

@@ -7,8 +7,9 @@
     player.step(0.01)                        # s
     player.positions["elbow"]                # as the encoder shows it
 
-It knows what a loop of ``mj_step`` over model.xml would have to: which actuator drives a joint and by what gear, that
-buffers of delayed commands and filters begin at rest, and that a joint with backlash or compliance is two joints.
+It does what a loop of ``mj_step`` over model.xml would have to do by hand: it finds the actuator of each joint and its
+gear, starts buffers of delayed commands and filters at rest, and adds up the two joints of one with backlash or
+compliance.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class Player:
         Parameters
         ----------
         source : folder with model.xml, or the file.
-        fixed_base : whether to take the free joint away, as of a robot that is held.
+        fixed_base : whether to remove the free joint, for a robot whose base is fixed.
 
         Raises
         ------
@@ -108,7 +109,9 @@ class Player:
         return np.asarray(values[self.index.qpos] + np.where(link >= 0, values[link], 0.0))
 
     def reset(self, positions: Values | None = None, velocities: Values | None = None) -> None:
-        """Begin anew: joints where they are told, at rest unless told, servos at ease, buffers and filters full.
+        """Start again: joints at the given positions and velocities, else at the model's own and at rest.
+
+        Position servos hold the joints there, and buffers of delayed commands and filters are settled.
 
         Raises
         ------
@@ -174,12 +177,14 @@ class Player:
         Raises
         ------
         UsageError
-            If the log has several episodes, or the model floats: there is no base state to start from.
+            If the log has several episodes, or the model has a free base, whose state the log does not hold.
         """
         if len(log.episodes()) > 1:
             raise UsageError("the log has several episodes: play one, such as log.window(0, 500)")
         if np.any(self.model.jnt_type == FREE):
-            raise UsageError("the model floats: load it with fixed_base=True to play the log of a robot that is held")
+            raise UsageError(
+                "the model has a free base: load it with fixed_base=True to play the log of a robot whose base is fixed"
+            )
         given, joints = commanded(log, self.model), self.index.joints
         qpos, qvel = initial_state(log, joints, self.model.qpos0[self.index.qpos])
         self.reset(dict(zip(joints, qpos, strict=True)), dict(zip(joints, qvel, strict=True)))

@@ -184,8 +184,18 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min"
 
 
-def watched(*, done: int, total: int | None, best: float, note: str) -> None:
+class Watched:
     """Progress where nothing is said: a line on stderr if that is a terminal or a notebook, else nothing."""
+
+    def __call__(self, *, done: int, total: int | None, best: float, note: str) -> None:
+        """Report nothing; `shows_progress` puts a line in its place."""
+
+    def __repr__(self) -> str:
+        return "watched"
+
+
+watched = Watched()
+"""The default of functions that show their progress."""
 
 
 def shows_progress(title: str) -> Callable[[Callable[P, T]], Callable[P, T]]:

@@ -27,7 +27,7 @@ def save(
 
     Parameters
     ----------
-    outcome : what `fit` or `close` returned.
+    outcome : what `fit`, `close` or `posterior` returned.
     out : folder, created if missing.
     seed : of the generator the estimator was given; recorded.
     overwrite : whether earlier results in the folder may be replaced.

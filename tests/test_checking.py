@@ -77,6 +77,19 @@ def test_what_would_show_does_and_what_would_not_does_not(checked: LogCheck, eff
     assert log_odds[1 / 3] < math.log(ODDS)
 
 
+def test_an_effect_of_several_numbers_is_sized_by_the_one_that_shows() -> None:
+    robot = leg()
+    asked = ["gravity_tilt", "stribeck_friction", "payload", "com_offset", "kp"]
+    found = sb.check(robot, [recorded(robot, seconds=2.0)], ["mass:knee"], effects=asked, threads=1)
+    units = {e.effect: e.unit for e in found.effects}
+    assert units == {"gravity_tilt": "rad", "stribeck_friction": "Nm", "payload": "kg", "com_offset": "m", "kp": "1"}
+    for one in found.effects:
+        assert one.size is None or one.size > 0, one
+        if one.effect == "kp":  # a factor: what leaves the model as it is is one
+            assert one.nominal == 1
+            assert one.size == pytest.approx(abs(one.shows_from - 1))
+
+
 def test_twins_are_said_to_be_confounded(checked: LogCheck) -> None:
     by_name = {(e.effect, e.where): e for e in checked.effects}
     assert {e.where for e in checked.effects} == set(JOINTS)

@@ -452,3 +452,23 @@ def test_ctrl_c_keeps_the_journal_and_resume_gives_the_same_answer(
     resumed = cli("fit", *search, "--out", out, "--resume", "--json")
     straight = cli("fit", *search, "--json")
     assert json.loads(resumed.out)["parameters"] == json.loads(straight.out)["parameters"]
+
+
+LEVER = """<mujoco><worldbody><body name="lever"><joint name="lever" axis="0 1 0" damping="5"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03" mass="1"/></body></worldbody>
+  <actuator><motor joint="lever"/></actuator></mujoco>"""
+
+
+def test_torques_that_look_like_mirrored_degrees_are_torques_to_a_robot_with_motors(cli: Cli, tmp_path: Path) -> None:
+    """A lever that is held against gravity: its torque follows its position, other way round and 60 times as far."""
+    model = tmp_path / "lever.xml"
+    model.write_text(LEVER)
+    clock = np.arange(400) * 0.01
+    angle = 0.4 * np.sin(2 * clock) + 0.2 * np.sin(3.1 * clock)
+    log = tmp_path / "lever.parquet"
+    channels = {"command.lever": -58.0 * angle, "position.lever": angle}
+    write_log(Log(clock, channels, LogMeta(robot="lever", sample_period=0.01), np.zeros(400, dtype=np.int64)), log)
+    assert cli("replay", "--model", str(model), "--log", str(log)).code == 0
+    alone = cli("validate", str(log))
+    assert alone.code == 3
+    assert 'set "drive": "torque" in the metadata' in " ".join((alone.out + alone.err).split())

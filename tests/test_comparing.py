@@ -120,7 +120,7 @@ def test_effects_come_and_go(runs: Path) -> None:
     [row] = sb.compare([runs / "new", runs / "worn"]).effects
     assert (row.effect, row.where, row.became) == ("coulomb_friction", "pendulum", "came")
     assert (
-        "coulomb_friction at pendulum went"
+        "coulomb_friction at pendulum is no longer found"
         in sb.compare([runs / "worn", runs / "new"], dates=["2026-01-01", "2026-01-02"]).message
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -19,6 +20,20 @@ def test_import_takes_less_than_300_ms() -> None:
         for _ in range(3)
     ]
     assert min(times) < 0.3
+
+
+def test_help_takes_less_than_500_ms() -> None:
+    code = "import sys; from sysid_btr.cli import main; sys.argv = ['sysid-btr', '--help']; main()"
+    times = []
+    for _ in range(3):
+        began = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        times.append(time.perf_counter() - began)
+        assert done.returncode == 0, done.stderr
+        verbs = done.stdout.partition("Commands:")[2].partition("Exit codes:")[0]
+        assert "close" in verbs
+        assert "..." not in verbs, "what a verb does fits the line of a narrow terminal"
+    assert min(times) < 0.5
 
 
 @pytest.mark.parametrize("module", ["sysid_btr", "sysid_btr.cli"])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -150,12 +152,24 @@ def test_a_result_is_what_its_schema_says_and_nothing_else(study: Study) -> None
     for wrong in ({**result, "chi2": 1.0}, {**result, "verdict": "perhaps"}, {**result, "covariance": None}):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(wrong, schema)
-    undocumented = [
-        name
-        for name, entry in schema["properties"].items()
-        if not {"description", "const", "enum", "$ref"} & set(entry)
-    ]
-    assert undocumented == []
+
+
+def undescribed(entry: Any, name: str = "") -> Iterator[str]:
+    """Names within an entry of a schema that nothing describes."""
+    for inner, value in entry.get("properties", {}).items():
+        if not {"description", "$ref"} & set(value):
+            yield f"{name}.{inner}"
+        yield from undescribed(value, f"{name}.{inner}")
+    parts = [entry.get("items"), entry.get("additionalProperties"), *entry.get("anyOf", ())]
+    for part in parts:
+        if isinstance(part, dict):
+            yield from undescribed(part, name)
+
+
+def test_every_name_of_a_result_says_what_it_is() -> None:
+    schema = result_schema()
+    assert list(undescribed(schema)) == []
+    assert [name for key, entry in schema["$defs"].items() for name in undescribed(entry, key)] == []
 
 
 def test_round_trip(study: Study, tmp_path: Path) -> None:

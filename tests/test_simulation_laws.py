@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -71,6 +72,28 @@ def test_a_curve_of_what_is_not_a_number_is_finite(amounts: list[float]) -> None
 def test_every_curve_of_the_state_has_a_law_of_its_own() -> None:
     laws = [curve.law for curve in FREE_FORMS if curve.overrides("law")]
     assert len(set(laws)) == len(laws) == 8
+
+
+TETRAHEDRON = """<mujoco><option gravity="0 0 -9.81"/>
+  <asset><mesh name="t" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset>
+  <worldbody><body name="b"><joint name="a" axis="0 1 0"/><geom type="mesh" mesh="t" mass="1"/></body></worldbody>
+  <actuator><position joint="a" kp="5" kv=".3"/></actuator></mujoco>"""
+
+
+def test_of_the_boxes_of_a_mesh_no_more_is_copied_than_a_batch_holds() -> None:
+    """MuJoCo's batches hold the first of them alone, and what is beyond is not the candidates'."""
+    model = mujoco.MjModel.from_xml_string(TETRAHEDRON)
+    moving = model.bvh_aabb[:2] + np.arange(3)[:, None, None]
+    assert moving[0].nbytes < model.bvh_aabb.nbytes
+    ((thread, _owners),) = threads_of(model, {"bvh_aabb": moving}, {"qpos": np.zeros((3, 1))}, 1)
+    assert list(thread.copies.size) == [moving[0].nbytes, 8]
+
+
+def test_fields_that_a_model_does_not_have_in_this_shape_are_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(TETRAHEDRON)
+    for wrong in (np.zeros((3, 1, 2)), np.zeros((3, 5))):
+        with pytest.raises(ValueError, match="body_mass is"):
+            list(threads_of(model, {"body_mass": wrong}, {}, 1))
 
 
 @pytest.mark.parametrize("told", [0, 1])

@@ -6,6 +6,7 @@ import inspect
 import io
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,14 @@ from conftest import make_good_log
 import sysid_btr as sb
 from sysid_btr.cli.demo import sample_logs
 from sysid_btr.diagnosis.closing import Closing
+from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.display.tables import to_tables
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import correlations
 from sysid_btr.io.log import Log
 from sysid_btr.progress import ProgressLine, shows_progress, watched
+from sysid_btr.units import with_digits_of
 
 SAMPLES = sample_logs()
 MODEL = str(SAMPLES / "pendulum.xml")
@@ -185,6 +188,16 @@ def test_a_line_says_what_a_thing_is(name: str, request: pytest.FixtureRequest) 
     assert f"mass:arm {outcome.estimates[0].value:.2f}"[:11] in repr(outcome)
 
 
+def test_a_line_says_what_was_found(closed: Closing) -> None:
+    [effect] = closed.effects
+    assert repr(effect) == f"<NamedEffect {effect.sentence}; friction with over 99 % certainty>"
+    [friction] = effect.parameters
+    value = with_digits_of(friction.value, friction.std)
+    assert repr(friction) == f"<Estimate coulomb_friction:pendulum {value} Nm (std {friction.std:.2g})>"
+    unseen = replace(friction, identifiable="no", std=math.inf)
+    assert repr(unseen) == "<Estimate coulomb_friction:pendulum not identifiable>"
+
+
 # --- signatures and progress ------------------------------------------------------------------------------------
 
 
@@ -195,7 +208,16 @@ def test_signatures_are_those_of_what_is_called() -> None:
     assert list(shown.parameters) == list(real.parameters)
     assert [p.default for p in shown.parameters.values()] == [p.default for p in real.parameters.values()]
     for name in sb.__all__:
-        assert "args" not in inspect.signature(getattr(sb, name)).parameters, name
+        signature = inspect.signature(getattr(sb, name))
+        assert "args" not in signature.parameters, name
+        # as `help` shows it: no addresses, no defaults of many lines
+        assert " at 0x" not in str(signature), name
+        assert all(len(str(p)) < 120 for p in signature.parameters.values()), name
+
+
+def test_thresholds_show_what_was_changed() -> None:
+    assert repr(Selection()) == "Selection()"
+    assert repr(Selection(rounds=3)) == "Selection(rounds=3)"
 
 
 class Terminal(io.StringIO):

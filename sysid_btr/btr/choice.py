@@ -112,7 +112,7 @@ def improvement(offer: Offer, taken: Sequence[int], count: int) -> int | None:
     Bayesian optimisation under a constraint (Gelbart et al. 2014, arXiv 1403.5607).
     """
     if offer.foresight is None:
-        raise UsageError("btr: the choice 'improvement' weighs what drawn models say: take at least 2 draws")
+        raise UsageError("btr: the choice 'improvement' compares drawn models: take at least 2 draws")
     free = np.ones(len(offer.pool.expected), dtype=bool)
     free[list(taken)] = False
     stands = offer.foresight.stands

@@ -98,11 +98,14 @@ class Settings:
         if min(self.iterations, self.trials, self.memory, self.rivals, self.draws) < 1:
             raise UsageError("btr: iterations, trials, memory, rivals and draws must be at least 1")
         if self.draws == 1 and (self.choice == "improvement" or self.worthwhile is not None):
-            raise UsageError("btr: what another trial promises is seen in drawn models: take at least 2 draws")
+            raise UsageError("btr: what another trial may gain is computed in drawn models: take at least 2 draws")
         if self.draws > 1 and self.correct:
             raise UsageError("btr: the linear correction is of one model's fitness; take 1 draw")
         if self.close and (self.correct or not self.learn):
-            raise UsageError("btr: the model stays as it is (a linear correction, or no Step 3); nothing can be added")
+            raise UsageError(
+                "btr: effects are added only to a model that the trials correct: not with a linear correction, nor "
+                "without Step 3"
+            )
         if needs_residuals(self.models) and self.distance != LIKELIHOOD:
             raise UsageError(f"btr: least squares minimises a likelihood; give --distance {LIKELIHOOD}, or cmaes or ga")
         get_choice(self.choice)

@@ -116,11 +116,11 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
 
 
 def btr(options: BtrOptions) -> int:
-    """Back to Reality: search a controller in the model, try it on the robot, correct the model by that, again.
+    """Back to Reality: find a controller that works on the robot.
 
-    The robot is a simulation that the search does not see (--robot-sim), or a real one behind a folder (--exchange).
-    Exit 5 if the model no longer predicts which controller is better on the robot; the results are written all the
-    same.
+    Search for one in the model, try it on the robot, correct the model by the trial, and repeat. The robot is a
+    simulation that the search does not see (--robot-sim), or a real one behind a folder (--exchange). Exit 5 if
+    the model no longer predicts which controller is better on the robot; the results are written all the same.
     """
     from sysid_btr.btr.controllers import get_space
     from sysid_btr.btr.loop import back_to_reality

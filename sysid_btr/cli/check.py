@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,10 +19,12 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from sysid_btr.checking import LogCheck
+    from sysid_btr.checking import EffectCheck, LogCheck
 
-SHOWN = 30
-"""Effects that are printed; --json has all."""
+MENTIONED = 3
+"""Effects that are named as confounded with one; --json has all."""
+FEW = 2
+"""Places that are named one by one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,15 +39,16 @@ class CheckOptions(ModelOptions, ReadingOptions, ParameterOptions, ThreadOptions
 
 
 def check(options: CheckOptions) -> int:
-    """Say what a log is informative about, before anything is fitted: which parameters, which effects, from what size.
+    """Say what a log is informative about, before anything is fitted.
 
-    Also how each joint moves, which drives reach their limits, and which motion would be more informative.
+    Which parameters are identifiable and with what error, which effects would show and from what size, how each joint
+    moves, which drives reach their limits, and which motion would be more informative.
     """
     from sysid_btr.checking import check as check_logs
     from sysid_btr.progress import ProgressLine
 
     robot = find_robot(options, options.bounds)
-    logs = as_stated(read_logs(options.log), options)
+    logs = as_stated(read_logs(options.log, robot), options)
     warn_of(robot, logs)
     with ProgressLine("check") as progress:
         found = check_logs(
@@ -101,25 +105,42 @@ def _parts(found: LogCheck) -> Iterator[RenderableType]:
     ]
     yield _grid(("parameter", "nominal", "expected std", "unit", "identifiable"), parameters)
     yield from (Text(f"  {p.name}: {p.reason}") for p in found.parameters if p.reason)
-    shown = [e for e in found.effects if e.shows_from is not None]
-    table = [
-        (
-            f"{e.effect} at {e.where}",
-            f"{number(e.shows_from, 2)}{'' if e.unit == '1' else ' ' + e.unit}",
-            ", ".join(e.confounded_with),
-        )
-        for e in shown[:SHOWN]
-    ]
-    yield _grid((f"would show (odds {found.odds:g}:1)", "from", "confounded with"), table)
-    if len(shown) > SHOWN:
-        yield Text(f"  and {len(shown) - SHOWN} more (--json has all)")
-    hidden = sorted({e.effect for e in found.effects} - {e.effect for e in shown})
+    by_effect: dict[str, list[EffectCheck]] = {}
+    for effect in found.effects:
+        by_effect.setdefault(effect.effect, []).append(effect)
+    rows_of_effects = [_effect_row(name, places) for name, places in by_effect.items()]
+    yield _grid(
+        (f"effect (odds {found.odds:g}:1)", "would show at", "from a size of", "confounded with (at n places)"),
+        [row for row in rows_of_effects if row is not None],
+    )
+    hidden = [name for name, row in zip(by_effect, rows_of_effects, strict=True) if row is None]
     if hidden:
         yield Text(f"would show nowhere: {', '.join(hidden)}")
     if found.skipped:
         yield Text(f"not tried for lack of time (--budget): {', '.join(found.skipped)}")
     yield from (Text(f"-> {line}") for line in found.advice)
     yield Text("expected for a model that is right otherwise; what it lacks makes everything less certain", style="dim")
+
+
+def _effect_row(name: str, places: Sequence[EffectCheck]) -> tuple[str, str, str, str] | None:
+    """Where an effect would show, from which size, and what looks like it; None if nowhere."""
+    from sysid_btr.units import si_all
+
+    shown = [e for e in places if e.size is not None]
+    if not shown:
+        return None
+    where = ", ".join(e.where for e in shown) if len(shown) <= FEW else f"{len(shown)} of {len(places)} places"
+    by_unit: dict[str, list[float]] = {}
+    for e in shown:
+        by_unit.setdefault("x nominal" if e.unit == "1" and e.nominal == 1 else e.unit, []).append(e.size or 0.0)
+    sizes = []
+    for unit, values in by_unit.items():
+        low, high = si_all([min(values), max(values)], unit)
+        sizes.append(high if low == high else f"{low.partition(' ')[0]} .. {high}")
+    alike = Counter(other for e in shown for other in e.confounded_with).most_common()
+    words = [other if n == len(shown) else f"{other} ({n})" for other, n in alike[:MENTIONED]]
+    words += [f"{len(alike) - MENTIONED} more"] if len(alike) > MENTIONED else []
+    return name, where, " or ".join(sizes), ", ".join(words)
 
 
 def _grid(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> RenderableType:

@@ -33,12 +33,11 @@ class CloseOptions(NuisanceOptions, FittingOptions):
 
 
 def close(options: CloseOptions) -> int:
-    """Find what the model is missing: fit the parameters, trace what is left to an effect, add it, refit.
+    """Find what the model is missing, and add it.
 
-    Shows the held-out error before and after.
-
-    Without --fit all masses and the common servo gains are fitted, so that a wrong mass does not pass for an
-    effect.
+    Fits the parameters, traces what is left to an effect, adds it and fits again, and shows the held-out error
+    before and after. Without --fit all masses and the common servo gains are fitted, so that a wrong mass does
+    not pass for an effect.
     """
     from sysid_btr.diagnosis.close import close as close_loop
     from sysid_btr.terms.library import select_effects

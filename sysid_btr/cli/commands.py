@@ -31,11 +31,16 @@ from sysid_btr.cli.validate import validate
 from sysid_btr.errors import InterruptedRun, SysidError, UsageError
 from sysid_btr.progress import Interrupted, interruptible
 
-EXIT_CODES = """
-Exit codes: 0 done; 1 a defect of this program; 2 usage; 3 a log cannot be used; 4 the model cannot be used or
-does not fit the log; 5 finished and written, but the fit did not converge or none of its parameters is identifiable
-(some not identifiable beside others that are is a result: 0); 130 interrupted, journal kept;
-141 the reader of the output closed it.
+EXIT_CODES = """\b
+Exit codes:
+  0    done
+  1    a defect of this program
+  2    usage
+  3    a log cannot be used
+  4    the model cannot be used or does not fit the log
+  5    finished and written, but the fit did not converge or no parameter is identifiable
+  130  interrupted; the journal is kept, and --resume continues
+  141  the reader of the output closed it
 """
 OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 """What the system says where something cannot be written."""
@@ -199,12 +204,12 @@ DEBUG = inspect.Parameter(
 )
 app = typer.Typer(
     name="sysid-btr",
-    help="Make a MuJoCo model move like the robot in a log: which parameters, how certain, what is missing."
-    "\n\n" + EXIT_CODES,
+    help="Make a MuJoCo model move like the robot in a log: which parameters, how certain, what is missing.",
+    epilog=EXIT_CODES,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 for _verb in VERBS:
     app.command(_verb.__name__.rstrip("_"))(_command(_verb))

@@ -36,9 +36,10 @@ class CompareOptions(ModelOptions, ReadingOptions, ThreadOptions, JsonOptions):
 
 
 def compare(options: CompareOptions) -> int:
-    """Compare finished runs of one robot: which parameters differ, what drifts, which effects came or went.
+    """Compare finished runs of one robot: what differs, what drifts.
 
-    With --log also the error of every run's model on a common log.
+    Parameters side by side, which differences are real, and which effects came or went; with --log also the error of
+    every run's model on a common log.
     """
     from sysid_btr.comparing import compare as compare_runs
 
@@ -46,7 +47,7 @@ def compare(options: CompareOptions) -> int:
         raise UsageError("which runs? Give the --out folders of two or more: sysid-btr compare monday friday")
     _check_free(options)
     robot = None if options.model is None else find_robot(options)
-    logs = as_stated(read_logs(options.log), options) if options.log else []
+    logs = as_stated(read_logs(options.log, robot), options) if options.log else []
     if robot is not None:
         warn_of(robot, logs)
     found = compare_runs(options.runs, logs=logs, robot=robot, dates=options.dates or None, threads=options.threads)

@@ -23,9 +23,10 @@ class DemoOptions(ThreadOptions):
 
 
 def demo(options: DemoOptions) -> int:
-    """One minute: close the loop on a sample log whose robot has something that its model lacks.
+    """Close the loop on a sample log, in about a minute.
 
-    And on a measured log, where the recordings are at hand (SYSID_BTR_DATA).
+    The robot of the sample has something that its model lacks. Where the recordings are at hand (SYSID_BTR_DATA), a
+    measured log follows.
     """
     for case in cases():
         remark(f"\n== {case.title}\n$ {case.command(options.out)}")

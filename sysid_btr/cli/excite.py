@@ -47,7 +47,7 @@ class ExciteOptions(ModelOptions, LogOptions, ParameterOptions, SeedOptions, Thr
     joints: Names = option((), "Joints that move.", otherwise="all with a servo", metavar="GLOB[,GLOB..]", decides=True)
     margin: float = option(
         MotionSettings.margin,
-        "Part of each joint's range that is not used, at either end.",
+        "Fraction of each joint's range that is left free at either end.",
         metavar="FRACTION",
         decides=True,
     )
@@ -74,11 +74,12 @@ class ExciteOptions(ModelOptions, LogOptions, ParameterOptions, SeedOptions, Thr
 
 
 def excite(options: ExciteOptions) -> int:
-    """Design a motion that makes chosen parameters identifiable, and say which intervals to expect from it.
+    """Design a motion that makes chosen parameters identifiable.
 
-    Writes excite.parquet, a log of commands to play on the robot (its torso fixed), result.json and a figure. It is
-    compared with the motion of --log, which also gives the noise of the sensors, or else with the first motion of the
-    search. Only the limits of the joints keep the motion from hitting the robot itself or the ground.
+    Writes excite.parquet, a log of commands to play on the robot (its torso fixed), result.json and a figure, and says
+    which intervals to expect. The motion is compared with that of --log, which also gives the noise of the sensors, or
+    else with the first motion of the search. Collisions are not checked: only the joints' limits keep the robot from
+    hitting itself or the ground.
     """
     from sysid_btr.excite import outcome
     from sysid_btr.result import exit_code
@@ -90,7 +91,7 @@ def excite(options: ExciteOptions) -> int:
         raise UsageError("--out DIR is required: the folder for the motion")
     if len(options.log) > 1:
         raise UsageError("a motion is compared with one reference: give --log once")
-    reference = read_logs(options.log)[0] if options.log else None
+    reference = read_logs(options.log, robot)[0] if options.log else None
     found, folder = _search(options, robot, reference)
     result = outcome.make_result(found, seed=options.seed)
     remark(f"report: {save_motion(folder, found, result)}")

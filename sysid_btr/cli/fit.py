@@ -34,10 +34,10 @@ class FitOptions(NuisanceOptions, SearchingOptions):
 
 
 def fit(options: FitOptions) -> int:
-    """Fit parameters of the model to the log: values, intervals, error before and after on held-out data.
+    """Fit parameters of the model: values, intervals, held-out error.
 
-    Exit 5 if the search did not converge or none of the parameters is identifiable; the results are written all the
-    same.
+    Without --fit, lists what can be fitted. Exit 5 if the search did not converge or none of the parameters is
+    identifiable; the results are written all the same.
     """
     from sysid_btr.identify.profile import chosen_names, with_profiles
 

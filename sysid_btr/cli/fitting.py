@@ -87,7 +87,7 @@ class Run:
     def open(cls, verb: str, options: FittingOptions, robot: Robot) -> Run:
         """Read logs and open the journal; nothing is simulated yet."""
         check_channels(options.channels)
-        logs = as_stated(read_logs(options.log), options)
+        logs = as_stated(read_logs(options.log, robot), options)
         run = cls(verb, options, robot, logs, Keeper.open(verb, options, robot))
         if options.render and run.keeper.folder is None:
             raise UsageError("--render writes pictures: give an --out folder for them")
@@ -104,7 +104,7 @@ class Run:
         return make_study(
             self.robot,
             self.logs,
-            holdout=read_holdout(self.options.holdout, self.options),
+            holdout=read_holdout(self.options.holdout, self.robot, self.options),
             channels=self.options.channels or FITTED,
             numerics=None if self.options.numerics is None else Numerics.parse(self.options.numerics),
             simulator=self.options.simulator,

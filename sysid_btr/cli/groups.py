@@ -20,13 +20,13 @@ class ModelOptions(Options):
     )
     servo: Names = option(
         (),
-        "Position servos for joints that have none, in the place of motors.",
+        "Put position servos on the joints that have none, in place of their motors.",
         metavar="kp=GAIN[,kv=GAIN]",
         decides=True,
     )
     at: Names = option(
         (),
-        "Where joints stand that are not logged, rad or m.",
+        "Positions of joints that are not logged, rad or m.",
         otherwise="the log's metadata, the model's first keyframe, or zero",
         metavar="JOINT=VALUE|keyframe:NAME[,..]",
         decides=True,
@@ -133,7 +133,7 @@ class StudyOptions(ModelOptions, ReadingOptions, ParameterOptions, ParamsOptions
 
     holdout: Holdout = option(
         HOLDOUT,
-        "Logs that are not fitted but predicted, or the last fraction of each log.",
+        "Held-out data, which are predicted and not fitted: logs, or the last fraction of each log.",
         metavar="FILE|FRACTION",
         beside=True,
         decides=True,
@@ -214,7 +214,7 @@ class ExecutorOptions(RunOptions):
 class JsonOptions(RunOptions):
     """What is printed."""
 
-    json: bool = option(False, "Print result.json instead of tables.", decides=False)
+    json: bool = option(False, "Print the result as JSON instead of tables.", decides=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,8 +223,8 @@ class OutOptions(RunOptions):
 
     out: Path | None = option(
         None,
-        "Folder for result.json, model.xml, params.json, report.html, explore.html, pictures and the journal. Without "
-        "it nothing is written: results are only printed.",
+        "Folder for the results: result.json, reports, pictures, the journal, and what the verb makes. Without it "
+        "nothing is written: results are only printed.",
         short="-o",
         metavar="DIR",
         decides=False,
@@ -255,7 +255,8 @@ class NuisanceOptions(Options):
 
     nuisance: Numbers = option(
         {},
-        "Standard deviation of what is not fitted, e.g. mass=0.1 (10 %): intervals then do not take it as exact.",
+        "How well parameters are known that are not fitted, as a standard deviation, e.g. mass=0.1 (10 %).",
+        otherwise="intervals take them as exact",
         metavar="NAME=STD",
         decides=True,
     )

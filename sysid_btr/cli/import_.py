@@ -33,7 +33,10 @@ class ImportOptions(ModelOptions):
         None, "Mapping that comes with the package; --map and flags go on top of it.", metavar="NAME", decides=False
     )
     show_preset: str | None = option(
-        None, "Print a preset, to copy and alter, and do nothing else; `all` lists them.", metavar="NAME", decides=False
+        None,
+        "Print a preset, to copy and edit, and do nothing else; `all` lists all presets.",
+        metavar="NAME",
+        decides=False,
     )
     map: Path | None = option(
         None, "Mapping (TOML): columns, units, joints, topics, metadata.", metavar="FILE", decides=False
@@ -52,15 +55,16 @@ class ImportOptions(ModelOptions):
         None, "Log to write (Parquet); without it nothing is written.", short="-o", metavar="FILE", decides=False
     )
     overwrite: bool = option(False, "Replace the file at --out.", decides=False)
-    force: bool = option(False, "Write the log although the validation finds errors, to repair it.", decides=False)
+    force: bool = option(False, "Write the log even if it has errors, e.g. to repair it.", decides=False)
     json: bool = option(False, "Print what was found as JSON.", decides=False)
 
 
 def import_(options: ImportOptions) -> int:
-    """Convert logs of other formats to logs of this program, and check them; several files are episodes of one log.
+    """Convert logs of other formats, and check them.
 
-    Every unrecognised column or topic is reported. A table whose columns cannot be guessed gets a mapping file on
-    standard output, to fill in. With errors in it the log is not written (exit 3), unless --force is given.
+    Several files are episodes of one log. Every unrecognised column or topic is reported. For a table whose
+    columns cannot be guessed, a mapping file to fill in is printed. A log with errors is not written (exit 3),
+    unless --force is given.
     """
     if options.show_preset is not None:
         sys.stdout.write(_preset(options.show_preset))

@@ -24,15 +24,16 @@ class InitOptions(ModelOptions):
 
 
 def init(options: InitOptions) -> int:
-    """Write a study file to begin with: what the log holds, and which parameters it may identify, line by line.
+    """Write a commented study file for a log, ready to run.
 
-    It runs as it is: sysid-btr fit --config FILE, or close --config FILE.
+    It says line by line what the log holds and which parameters it may identify. Run it with sysid-btr fit
+    --config FILE, or close --config FILE.
     """
     from sysid_btr.cli.proposal import study_file
     from sysid_btr.run_folder import Folder
 
     robot = find_robot(options)
-    logs = read_logs(options.files)
+    logs = read_logs(options.files, robot)
     target = output_file(options.out, options.files, options.overwrite)
     warn_of(robot, logs)
     text = study_file(robot, logs, options.model or robot.name, target)

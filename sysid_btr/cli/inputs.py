@@ -79,17 +79,20 @@ def _check_names(robot: Robot, bounds: Iterable[str]) -> None:
         raise UsageError("\n".join(problems))
 
 
-def read_logs(paths: Iterable[Path], *, motions: bool = False) -> list[Log]:
-    """All logs, or one error that lists what is wrong with each of them.
+def read_logs(paths: Iterable[Path], robot: Robot | None = None, *, motions: bool = False) -> list[Log]:
+    """All logs, or one error that lists what is wrong with each of them, whatever the robot.
 
-    A motion that nobody has recorded yet counts as wrong, unless `motions` are wanted.
+    What their commands are follows the robot's drives, where it is known. A motion that nobody has recorded yet counts
+    as wrong, unless `motions` are wanted.
     """
     from sysid_btr.io.parquet import read_log
+    from sysid_btr.terms.drives import joint_drives
 
+    drives = None if robot is None else {drive.joint: drive.kind for drive in joint_drives(robot.model)}
     logs, problems = [], []
     for path in paths:
         try:
-            log = read_log(path)
+            log = read_log(path, drives=drives)
         except LogError as error:
             problems.append(str(error))
             continue
@@ -106,9 +109,9 @@ def read_logs(paths: Iterable[Path], *, motions: bool = False) -> list[Log]:
     return logs
 
 
-def read_holdout(given: Holdout, options: ReadingOptions) -> float | list[Log]:
+def read_holdout(given: Holdout, robot: Robot, options: ReadingOptions) -> float | list[Log]:
     """The fraction, or the logs, that are not fitted."""
-    return as_stated(read_logs(given), options) if isinstance(given, tuple) else given
+    return as_stated(read_logs(given, robot), options) if isinstance(given, tuple) else given
 
 
 def as_stated(logs: list[Log], options: ReadingOptions) -> list[Log]:

@@ -72,7 +72,9 @@ class Option:
             words = f"{self.help} Repeatable." if self.repeatable else self.help
             words += f" [default: {self.otherwise}]" if self.otherwise else ""
             names = [self.flag, self.short] if self.short else [self.flag]
-            how = typer.Option(*names, metavar=self.metavar, min=self.least, help=words)
+            how = typer.Option(
+                *names, metavar=self.metavar, min=self.least, help=words, show_default=not self.otherwise
+            )
         typed, default = self.kind.typed, self.default
         if self.required:
             default = inspect.Parameter.empty

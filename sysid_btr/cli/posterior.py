@@ -49,10 +49,11 @@ class PosteriorOptions(SearchingOptions):
 
 
 def posterior(options: PosteriorOptions) -> int:
-    """Fit, then draw the posterior of the parameters with real replays, until independent ensembles agree.
+    """Draw the posterior of the parameters, after a fit.
 
-    Writes posterior.nc (ArviZ), a corner plot, traces and predictions of held-out data with their bands. Exit 5 if
-    it has not converged when the replays are used up; the results are written all the same.
+    Every draw is simulated; sampling goes on until independent ensembles agree. Writes posterior.nc (ArviZ), a
+    corner plot, traces and predictions of held-out data with their bands. Exit 5 if it has not converged when the
+    replays are used up; the results are written all the same.
     """
     from sysid_btr.estimators.base import Budget
     from sysid_btr.estimators.ensemble import walkers_for

@@ -46,13 +46,14 @@ class ReplayOptions(
 
 
 def replay(options: ReplayOptions) -> int:
-    """Give the log's commands to the model and compare its sensors with the log's; nothing is fitted.
+    """Replay a log in the model, and compare their sensors.
 
-    A motion that was not recorded yet (excite.parquet) is only played: where every joint goes, and the predicted log.
+    The model gets the log's commands, and nothing is fitted. A motion that was not recorded yet (excite.parquet)
+    is only played, which shows where every joint goes; --out keeps the predicted log.
     """
     began = time.perf_counter()
     robot = find_robot(options)
-    logs = as_stated(read_logs(options.log, motions=True), options)
+    logs = as_stated(read_logs(options.log, robot, motions=True), options)
     model, numerics = _changed(robot, options)
     targets = _targets(options.out, logs, options.overwrite)
     warn_of(robot, [one for one in logs if not one.is_motion])

@@ -18,7 +18,10 @@ class ReportOptions(Options):
 
 
 def report(options: ReportOptions) -> int:
-    """Write report.html and explore.html again from result.json, pictures and series of a finished run of any verb."""
+    """Write the reports of a finished run again.
+
+    report.html and explore.html, from the result.json, pictures and series that the run left in its folder.
+    """
     from jinja2 import TemplateError
 
     from sysid_btr.report.pictures import write_report

@@ -23,7 +23,10 @@ class ValidateOptions(LogOptions, ModelOptions, JsonOptions):
 
 
 def validate(options: ValidateOptions) -> int:
-    """List every problem of a log, where it is, and what to do about it (exit 3 on errors)."""
+    """List every problem of a log, where it is, and what to do.
+
+    Exit 3 if there are errors; warnings and notes leave a log usable.
+    """
     from sysid_btr.io.problem import errors_of
     from sysid_btr.io.validation import validate_file
     from sysid_btr.models.log_checks import check_log

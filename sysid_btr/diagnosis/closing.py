@@ -13,11 +13,12 @@ from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.scores import Scores
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.model import Model
+from sysid_btr.units import probability
 
 Verdict = Literal["explained", "partly_explained", "nothing_missing", "ambiguous", "unexplained"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class NamedEffect:
     """An effect that the log shows and the model lacked.
 
@@ -51,6 +52,11 @@ class NamedEffect:
     confused_with: tuple[str, ...]
     sentence: str
     evidence: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        return (
+            f"<NamedEffect {self.sentence or self.effect}; {self.family} with {probability(self.certainty)} certainty>"
+        )
 
     @property
     def likely(self) -> bool:

@@ -11,11 +11,11 @@ from sysid_btr.diagnosis.closing import NamedEffect, Verdict
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import Scores
 from sysid_btr.terms.effect import Effect
-from sysid_btr.units import probability, si_all
+from sysid_btr.units import probability, si_all, with_digits_of
 
 
 def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
-    """One effect with places, amounts and intervals."""
+    """One effect with places and amounts; what follows +- is half of the 95 % interval, and the sentence says so."""
     kinds = len(effect.kinds)
     parts = []
     for i, group in enumerate(effect.groups):
@@ -23,8 +23,10 @@ def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
         amounts = effect.in_words(group.partition(",")[0], np.array([e.value for e in own])) or ", ".join(
             _amount(e, k.name, kinds > 1) for e, k in zip(own, effect.kinds, strict=True)
         )
-        parts.append(f"{_places(group.split(','))}: {amounts}")
-    return f"{effect.title}: " + "; ".join(parts)
+        where = "" if effect.scope == "robot" else f" at {_places(group.split(','))}"
+        parts.append(f"{where}: {amounts}")
+    text = effect.title + ";".join(parts)
+    return f"{text} (95 %)" if "+-" in text else text
 
 
 def _places(names: Sequence[str]) -> str:
@@ -32,7 +34,7 @@ def _places(names: Sequence[str]) -> str:
 
 
 def _left(before: Scores, after: Scores, channel: str) -> str:
-    """How much of the error above the noise floor, squared, is left of the fitted and of the held-out part."""
+    """How much of the squared error above the noise floor is left in fitted and in held-out data."""
     parts = {"fitted": (before.train, after.train), "held-out": (before.holdout, after.holdout)}
     shares = {
         name: (new[channel].chi2 - 1) / max(old[channel].chi2 - 1, 1e-12)
@@ -40,13 +42,14 @@ def _left(before: Scores, after: Scores, channel: str) -> str:
         if channel in old and channel in new
     }
     percent = {name: 100 * max(share, 0.0) for name, share in shares.items()}
-    return " and ".join(f"{p:{'.0f' if p >= 1 else '.1g'}} % of the {name}" for name, p in percent.items()) + " error"
+    listing = " and ".join(f"{p:{'.0f' if p >= 1 else '.1g'}} % in {name}" for name, p in percent.items())
+    return f"{listing} data"
 
 
 def _amount(estimate: Estimate, kind: str, label: bool) -> str:
     half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
     unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    text = f"{estimate.value:.3g} +- {half:.2g}{unit}"
+    text = f"{with_digits_of(estimate.value, half)} +- {with_digits_of(half, half)}{unit}"
     return f"{kind} {text}" if label else text
 
 
@@ -74,7 +77,10 @@ def message_of(
         if effects:
             listing = ", ".join(f"{e.effect} at {_places(e.where)}" for e in effects)
             rest = _left(before, nearest, channel)
-            hint = f" The nearest, {listing}, leaves {rest} (squared), and is less likely than not.{hint}"
+            hint = (
+                f" The nearest, {listing}, leaves {rest} of the squared error above the noise, and is less likely "
+                f"right than not.{hint}"
+            )
         return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
     listing = "; ".join(e.sentence for e in effects)
     if verdict == "partly_explained":
@@ -91,12 +97,12 @@ def _partly(effects: Sequence[NamedEffect], rest: str, left: Mapping[str, Any] |
     """What is likely, what else was added, and what is left."""
     likely = [e for e in effects if e.likely]
     text = "Partly explained: the model lacks " + "; ".join(
-        f"{e.sentence} ({probability(e.certainty)} certain of the {e.family}{', its form open' * e.provisional})"
+        f"{e.sentence}, {e.family} with {probability(e.certainty)} certainty{', its form open' * e.provisional}"
         for e in likely
     )
     others = [e for e in effects if not e.likely]
     if others:
-        added = "; ".join(f"{e.sentence} ({probability(e.certainty)})" for e in others)
+        added = "; ".join(f"{e.sentence}, {e.family} with {probability(e.certainty)} certainty" for e in others)
         text += f". Also added, less likely than not to be what it is called: {added}"
-    text += f". {rest[0].upper()}{rest[1:]} (squared, above the noise) is left"
+    text += f". Of the squared error above the noise, {rest} is left"
     return text + (f": {left.get('summary', 'not characterised')}." if left else ".")

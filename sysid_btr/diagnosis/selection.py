@@ -6,7 +6,7 @@ compare hypotheses with one another are in `sysid_btr.diagnosis.trials`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted, paired_t
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Selection:
     """Thresholds of a diagnosis, each with what set it.
 
@@ -190,6 +190,11 @@ class Selection:
     """Fraction of an excess that counts as nearly all. Judgement."""
     brief: int = 3
     """What happens within fewer stretches of half a second happens once, and cannot be shared out. Judgement."""
+
+    def __repr__(self) -> str:
+        """What differs from the standard thresholds, so that signatures stay short."""
+        values = ((f.name, getattr(self, f.name), f.default) for f in fields(self))
+        return f"Selection({', '.join(f'{name}={value!r}' for name, value, usual in values if value != usual)})"
 
 
 STANDARD = Selection()

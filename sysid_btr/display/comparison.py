@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 Table = tuple[str, list[str], list[list[str]]]
 """Heading, names of the columns, and rows of texts."""
+BECAME = {"stayed": "found in all", "came": "new", "went": "no longer found", "came and went": "found in some"}
+"""What became of an effect from the first run to the last, in words."""
 
 
 def flat_rows(content: Mapping[str, Any], table: str) -> Iterator[dict[str, Any]]:
@@ -48,7 +50,7 @@ def tables(content: Mapping[str, Any]) -> Iterator[Table]:
     labels = [f"{run['label']}{_on(run['date'])}" for run in content["runs"]]
     rows = content["parameters"]
     drifts = any(row["drift"] is not None for row in rows)
-    columns = ["parameter", *labels, "unit", "change (last - first)", "over its standard error", "real"]
+    columns = ["parameter", *labels, "unit", "change", "z", "real"]
     texts = [
         [
             row["name"],
@@ -67,7 +69,7 @@ def tables(content: Mapping[str, Any]) -> Iterator[Table]:
             [
                 f"{e['effect']} at {e['where']}",
                 *("-" if c is None else probability(c) for c in e["certainty"]),
-                e["became"],
+                BECAME[e["became"]],
             ]
             for e in content["effects"]
         ]
@@ -118,8 +120,9 @@ def _error(row: Mapping[str, Any]) -> list[str]:
 def rule(content: Mapping[str, Any]) -> str:
     """How it is decided whether a difference is real."""
     return (
-        "A difference is real where Cochran's Q (for two runs: the difference over its joint standard error, squared) "
-        f"is too large for chance: p below {content['chance']:g}, after Holm's correction for the number of parameters."
+        "Change: of the last run from the first; z: that over its standard error. A difference is real where "
+        f"Cochran's Q (of two runs: z squared) is too large for chance: p below {content['chance']:g}, after Holm's "
+        "correction for the number of parameters."
     )
 
 
@@ -139,7 +142,7 @@ def show(content: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield Text(f"\n{title}")
         yield grid
     yield Text("\n" + rule(content), style="dim")
-    yield from (Text(remark) for remark in content["remarks"])
+    yield from (Text(f"note: {remark}") for remark in content["remarks"])
 
 
 def page(content: Mapping[str, Any], *, whole: bool = True) -> str:

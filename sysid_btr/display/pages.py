@@ -16,10 +16,17 @@ def templates(folder: Path) -> Environment:
     """The templates in a folder; what they are given is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    return Environment(
+    made = Environment(
         loader=FileSystemLoader([folder, STYLE]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.filters["typeset"] = typeset
+    return made
+
+
+def typeset(text: str) -> str:
+    """With signs that a terminal may not have."""
+    return text.replace("+-", "±").replace("->", "→").replace(" .. ", " … ")

@@ -108,12 +108,12 @@ def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]
 
 def certainty_words(effect: Mapping[str, Any]) -> str:
     """How sure a name is, what else it would be, and what it explains."""
-    text = f"{probability(effect['certainty'])} certain of the {effect['family']}"
+    text = f"{effect['family']} with {probability(effect['certainty'])} certainty"
     others = [f"{name} {probability(p)}" for name, p in effect["otherwise"].items() if p >= MENTIONED]
     if others:
-        text += f" (else {', '.join(others)})"
-    gone = [f"{100 * effect['explains'][part]:.3g} % of the {name}" for part, name in PARTS]
-    text += f"; it removes {' and '.join(gone)} error above the noise (squared)"
+        text += f" (otherwise {', '.join(others)})"
+    gone = [f"{100 * effect['explains'][part]:.3g} % in {name}" for part, name in PARTS]
+    text += f"; of the squared error above the noise it removes {' and '.join(gone)} data"
     return text + ("; something is left where it acts, so its form is provisional" if effect["provisional"] else "")
 
 

@@ -166,7 +166,7 @@ def fit(
     Raises
     ------
     UsageError
-        If nothing is freed, or least squares are asked to minimise a distance.
+        If no parameter is named, or least squares are asked to minimise a distance.
 
     Returns
     -------

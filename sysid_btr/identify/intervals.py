@@ -14,6 +14,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.objectives.covariance import RANK, Known, spread
 from sysid_btr.terms.base import Parameter
+from sysid_btr.units import with_digits_of
 
 Identifiable = Literal["yes", "weak", "no"]
 NORMAL = 1.96
@@ -26,7 +27,7 @@ TOGETHER = ("correlation", "change", "moves")
 """Of an estimate, what results have in ``correlation`` and ``sensitivity``."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Estimate:
     """One parameter of a result, as result.json has it.
 
@@ -55,9 +56,18 @@ class Estimate:
     at_bound: bool
     reason: str
     std_if_right: float | None = None
-    correlation: tuple[float, ...] = field(default=(), repr=False, compare=False)
-    change: float = field(default=0.0, repr=False, compare=False)
-    moves: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
+    correlation: tuple[float, ...] = field(default=(), compare=False)
+    change: float = field(default=0.0, compare=False)
+    moves: Mapping[str, float] = field(default_factory=dict, compare=False)
+
+    def __str__(self) -> str:
+        if self.identifiable == "no":
+            return f"{self.name} not identifiable"
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{self.name} {with_digits_of(self.value, self.std)}{unit} (std {self.std:.2g})"
+
+    def __repr__(self) -> str:
+        return f"<Estimate {self}>"
 
     def to_dict(self) -> dict[str, Any]:
         """As results have it; what is said of all parameters together they have in matrices of their own."""

@@ -132,8 +132,8 @@ def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
     suited = _kind("innovations").suits(robot, log)
     if mode.asked == "innovations" and not suited:
         raise UsageError(
-            f"--mode innovations: {log.path or 'the log'} does not suit it: it takes samples at equal intervals, and a "
-            "model whose drives have no memory. Replay it by segments: --mode segments"
+            f"--mode innovations cannot be used with {log.path or 'the log'}: it needs samples at equal intervals and "
+            "drives without memory. Compare it by segments: --mode segments"
         )
     if mode.asked == "innovations":
         return "innovations", "as asked for"
@@ -143,7 +143,7 @@ def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
         return "floating", "as asked for"
     raise UsageError(
         f"--mode {mode.asked}{f', --segments {mode.segments}' if mode.seconds > 0 else ''}: {log.path or 'the log'} is "
-        "of a floating base: choose --mode innovations, which asks nothing of the ground, or --mode segments, whose "
+        "of a floating base: choose --mode innovations, which does not need the ground, or --mode segments, whose "
         "length it chooses itself"
     )
 

@@ -47,8 +47,8 @@ def error_of_the_rest(study: Study, model: Model, jacobian: FloatArray) -> Float
         return np.zeros(len(model.values))
     if study.procedure.fuses:
         raise UsageError(
-            "--nuisance: of a floating-base log in segments the contact-free motion counts too, for which this is not "
-            "known; fit what may be off, or use --mode innovations"
+            "--nuisance is not available for a floating-base log in segments, because contact-free estimation does not "
+            "allow for it; fit what may be off, or use --mode innovations"
         )
     rest = list(_undeclared(study, model.terms))
     if not rest:

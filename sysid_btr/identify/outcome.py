@@ -18,7 +18,7 @@ from sysid_btr.models.robot import channel_units
 from sysid_btr.result import SCHEMA, clean, versions
 from sysid_btr.simulation.numerics import MUJOCO
 from sysid_btr.terms.model import Model
-from sysid_btr.units import si_all, with_digits_of
+from sysid_btr.units import si_all
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -124,7 +124,7 @@ class StudyOutcome:
         return residuals(self.study, self.model)
 
     def __repr__(self) -> str:
-        known = [f"{e.name} {with_digits_of(e.value, e.std)} (std {e.std:.2g})" for e in self.estimates[:SHOWN]]
+        known = [str(estimate) for estimate in self.estimates[:SHOWN]]
         more = [f"{len(self.estimates) - SHOWN} more"] if len(self.estimates) > SHOWN else []
         verdict = f"{self.found['verdict']}: " if "verdict" in self.found else ""
         return f"<{type(self).__name__} of {self.study.robot.name}: {verdict}{', '.join([*known, *more])}>"

@@ -203,7 +203,7 @@ def make_study(
     nuisance: Mapping[str, float] | None = None,
     progress: Progress = watched,
 ) -> Study:
-    """Lay out an identification.
+    """Set up an identification: what is fitted, what is held out, and how logs and model are compared.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.io._check_units import is_linear
+from sysid_btr.io._check_units import TORQUES, is_linear
 from sysid_btr.io._text import at, by_channel, mirror_name, runs, some, spread
 from sysid_btr.io._tracking import Tracking, best_lag, driven, moves
 from sysid_btr.io.log import Log
@@ -53,7 +53,7 @@ def check_motion(log: Log, tracking: Mapping[str, Tracking], kinds: Mapping[str,
             "error",
             some(flipped),
             "the position moves opposite to the command: one of the two has the wrong sign",
-            "negate the column that does not follow the model's joint axis",
+            f"negate the column that does not follow the model's joint axis; {TORQUES}",
         )
     yield from _stuck(log, positions)
     left = {j: t for j, t in tracking.items() if j not in explained and j not in flipped}

@@ -14,6 +14,8 @@ from sysid_btr.io.log import Log, closest
 from sysid_btr.io.problem import Problem
 
 DEGREES = 180 / math.pi
+TORQUES = 'commands that are torques: set "drive": "torque" in the metadata'
+"""What to do about commands that are no positions, where the robot is not known."""
 
 # Accepted spellings, the schema's own first; blanks, dots and ^ are ignored, case is not.
 _ALLOWED: Mapping[str, tuple[str, ...]] = {
@@ -174,7 +176,8 @@ def check_scale(
             by_channel(list(degrees)),
             f"{'these values look' if len(degrees) > 1 else 'the values look'} like degrees, not radians: {example}",
             f"multiply by pi/180 (check every joint of the channel); a joint that really turns so far: "
-            f'set "units": {{"{column}": "rad"}} in the metadata',
+            f'set "units": {{"{column}": "rad"}} in the metadata'
+            + (f"; {TORQUES}" if column.startswith("command.") else ""),
         )
     if shrunk:
         yield Problem(

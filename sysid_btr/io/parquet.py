@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-def read_log(path: str | os.PathLike[str], *, check: bool = True) -> Log:
+def read_log(path: str | os.PathLike[str], *, check: bool = True, drives: Mapping[str, str] | None = None) -> Log:
     """Read a log.
 
     Parameters
@@ -32,6 +33,8 @@ def read_log(path: str | os.PathLike[str], *, check: bool = True) -> Log:
     check : bool
         Also validate the content, and refuse a log with an error in it. Warnings never refuse a log;
         see `sysid_btr.io.validate_file` for all findings.
+    drives : mapping of str to {"position", "velocity", "torque"}, optional
+        What a command of a joint is to the robot's drives, as of `validate_log`.
 
     Returns
     -------
@@ -46,7 +49,7 @@ def read_log(path: str | os.PathLike[str], *, check: bool = True) -> Log:
     """
     log, problems = load(Path(path))
     if check and log is not None:
-        problems += validate_log(log)
+        problems += validate_log(log, drives=drives)
     errors = errors_of(problems)
     if errors or log is None:
         raise LogError(explain(path, errors))

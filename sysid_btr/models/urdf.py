@@ -74,7 +74,7 @@ def _without_repeats(path: Path, root: ElementTree.Element) -> Iterator[str]:
                     same.append(where)
     if differ:
         raise ModelError(
-            f"model {path}: in a URDF each of these stands once, and which one counts is not clear:\n  "
+            f"model {path}: a URDF states each of these once, and it is not clear which one counts:\n  "
             + "\n  ".join(differ)
             + "\nDelete the wrong one of each."
         )

@@ -3,8 +3,16 @@
 >>> import sysid_btr as sb
 >>> drawn = sb.posterior(sb.fit(study, ["mass:*Knee*", "kp:*=shared"]))  # doctest: +SKIP
 
-``sysid_btr.posterior`` is this package, and the function at the same time: calling the package calls the function,
-``sb.posterior(fit, priors=..., settings=..., rng=..., budget=..., journal=..., progress=...)``.
+This package is called like the function of its name::
+
+    posterior(fit, *, priors=None, settings=None, rng=None, budget=None, journal=None, progress=watched) -> Posterior
+
+    fit : the fit whose parameters are wanted.
+    priors : name, glob or field -> prior as text, such as ``{"kp:*": "normal(1, 0.1)"}``.
+    settings : ensembles, walkers, criteria of convergence (`Settings`).
+    rng, budget, journal, progress : as of `sysid_btr.fit`; by default seed 0 and 20 000 replays.
+
+`sysid_btr.posterior.draw.posterior` has all of it.
 """
 
 from __future__ import annotations

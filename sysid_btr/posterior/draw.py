@@ -49,8 +49,8 @@ def posterior(
     At least two independent ensembles (emcee) start about the fit, wider than the posterior. Each proposal is the
     end of a chain under a quadratic model of the residuals, accepted or rejected by a real replay
     (`posterior.surrogate`), so the draws are exact whatever that model is worth; `Sample.surrogate` says how often
-    it was right. The likelihood counts correlated residuals and what the model lacks as the intervals of
-    `fit` do (`posterior.likelihood`). Converged when every ensemble is 50 autocorrelation times long and R-hat over
+    it was right. The likelihood counts correlated residuals as the intervals of `fit` do, but not what the model lacks
+    (`posterior.likelihood`). Converged when every ensemble is 50 autocorrelation times long and R-hat over
     the ensembles is below 1.01.
 
     Parameters

@@ -284,9 +284,9 @@ function tables() {
   const estimates = [...result.parameters, ...result.effects.flatMap(e => e.parameters)];
   table("parameters", "Parameters", "", [["parameter", "name"], ["number", p => estimates.indexOf(p) + 1], ["nominal", "nominal"],
     ["value", p => (known(p) ? p.value : null), p => like(p, p.value)], ["std", p => (known(p) ? p.std : null), p => (known(p) ? shown(p.std, 2) : "")],
-    ["95 % from", p => (known(p) ? p.ci95[0] : null), p => like(p, p.ci95[0])], ["to", p => (known(p) ? p.ci95[1] : null), p => like(p, p.ci95[1])], ["unit", unitOf], ["identifiable", p => (p.identifiable !== "no" && p.at_bound ? "at its bound" : { yes: "yes", weak: "weakly", no: "no" }[p.identifiable])], ["why not", "reason"]], estimates);
+    ["95 % from", p => (known(p) ? p.ci95[0] : null), p => like(p, p.ci95[0])], ["to", p => (known(p) ? p.ci95[1] : null), p => like(p, p.ci95[1])], ["unit", unitOf], ["identifiable", p => (p.identifiable !== "no" && p.at_bound ? "at its bound" : { yes: "yes", weak: "weakly", no: "no" }[p.identifiable])], ["reason", "reason"]], estimates);
   const percent = v => (v === null || v === undefined ? null : Math.round(1000 * v) / 10);
-  table("effects", "What the model lacked", "", [["effect", "effect"], ["where", e => e.where.join(", ")], ["in words", "sentence"], ["sure, %", e => e.certainty, e => (e.certainty > 0.995 ? "over 99" : e.certainty < 0.005 ? "under 1" : String(Math.round(100 * e.certainty)))],
+  table("effects", "What the model lacked", "", [["effect", "effect"], ["where", e => e.where.join(", ")], ["in words", "sentence"], ["certainty, %", e => e.certainty, e => (e.certainty > 0.995 ? "over 99" : e.certainty < 0.005 ? "under 1" : String(Math.round(100 * e.certainty)))],
     ["explains, % of fitted", e => percent(e.explains.train)], ["% of held out", e => percent(e.explains.holdout)], ["confounded with", e => e.confused_with.join(", ")]], result.effects);
   const step = s => [...s.added.map(a => `+ ${a}`), ...s.removed.map(a => `− ${a}`)].join(", ") || "parameters fitted";
   table("steps", "Steps", "chi2: mean square error over that of the noise, 1 at the floor.",

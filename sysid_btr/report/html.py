@@ -137,7 +137,6 @@ def environment() -> Environment:
         compact=compact,
         digits=with_digits_of,
         certainty=certainty_words,
-        typeset=_typeset,
         count=_count,
         breakable=_breakable,
     )
@@ -147,11 +146,6 @@ def environment() -> Environment:
 def _count(value: float | None) -> str:
     """A number of things."""
     return "-" if value is None else f"{value:,.0f}".replace(",", "\u202f")
-
-
-def _typeset(text: str) -> str:
-    """Signs that a terminal may not have."""
-    return text.replace("+-", "±").replace("->", "→")
 
 
 def _breakable(name: str) -> Markup:

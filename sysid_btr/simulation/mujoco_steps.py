@@ -111,15 +111,18 @@ def threads_of(model: mujoco.MjModel, fields: Fields, state: Fields, count: int)
     assert step is not None
     for _ in range(count):
         own = copy(model)
-        # a candidate that diverges is seen by its warnings: MuJoCo's reset would hide its states
-        own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         data = mujoco.MjData(own)
         rows = [(own.opt if n.startswith("opt.") else own, n.removeprefix("opt."), v) for n, v in fields.items()]
         rows += [(data, n, v) for n, v in state.items()]
         targets: list[Any] = [getattr(owner, name) for owner, name, _ in rows]
         sources = [np.ascontiguousarray(v, dtype=target.dtype) for (_, _, v), target in zip(rows, targets, strict=True)]
         at, start = (np.array([a.ctypes.data for a in arrays], dtype=np.int64) for arrays in (targets, sources))
-        copies = Copies(at, start, np.array([a.nbytes for a in targets], dtype=np.int64))
+        # MuJoCo's batches hold the first rows alone of what is longer and does not change, as of a mesh
+        sizes = np.array([a[0].nbytes for a in sources], dtype=np.int64)
+        for source, target, (_, name, _) in zip(sources, targets, rows, strict=True):
+            if source.shape[2:] != target.shape[1:] or source.shape[1:2] > target.shape[:1]:
+                raise ValueError(f"{name} is {target.shape}, and candidates have {source.shape[1:]}")
+        copies = Copies(at, start, sizes)
         engine = Engine(*(getattr(data if name in STATE else own, name) for name in Engine._fields))
         calls = Calls(reset, step, own._address, data._address)
         yield Thread(calls, copies, engine, data.warning.number), (own, data, targets, sources)
@@ -172,6 +175,7 @@ def _roll(first: int, last: int, plan: Plan, own: Candidates, thread: Thread, ke
                     given_torque(i, plan, own, memory, kept.effort[i, slot])
                 slot += 1
             call(calls.step, calls.model, calls.data)
+            # MuJoCo has reset the state of one that diverges, which it could not have collided
             if thread.warnings.any():
                 kept.failed[i] = True
                 break
