@@ -12,13 +12,13 @@ import json
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter, process_time, thread_time
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.phases import watched
 from benchmarks.replay import HERE, ROOT, machine
 from reference_simulator import Recording, save
 from reference_simulator.effects import CoulombFriction
@@ -51,42 +51,6 @@ TARGET = 1.7
 """What two workers are to be faster than one."""
 SECONDS = 60.0
 """What two threads are to take at most."""
-
-
-@dataclass
-class Physics:
-    """CPU seconds inside MuJoCo, of this process."""
-
-    seconds: float = 0.0
-    calls: Counter[str] = field(default_factory=Counter)
-
-
-@contextmanager
-def physics_clock() -> Iterator[Physics]:
-    """Time every call into the simulator."""
-    from mujoco.batch import Batch
-
-    found = Physics()
-
-    def timed(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **options: Any) -> Any:
-            began = process_time()
-            try:
-                return method(*args, **options)
-            finally:
-                found.seconds += process_time() - began
-                found.calls[name] += 1
-
-        return call
-
-    own = {name: getattr(Batch, name) for name in ("rollout", "step", "forward", "set_const")}
-    for name, method in own.items():
-        setattr(Batch, name, timed(name, method))
-    try:
-        yield found
-    finally:
-        for name, method in own.items():
-            setattr(Batch, name, method)
 
 
 class Watched(DaskExecutor):
@@ -144,7 +108,7 @@ def measure(case: str, place: str) -> dict[str, Any]:
 def _close(paths: Sequence[Path], executor: Executor, threads: int = 1) -> dict[str, Any]:
     logs = [read_log(path) for path in paths]
     wall, cpu, main_thread = perf_counter(), process_time(), thread_time()
-    with physics_clock() as physics:
+    with watched() as phases:
         study = make_study(load_robot(str(MODEL)), logs, threads=threads, executor=executor)
         closing = close(study, list(DECLARED))
     wall, cpu, main_thread = perf_counter() - wall, process_time() - cpu, thread_time() - main_thread
@@ -161,8 +125,8 @@ def _close(paths: Sequence[Path], executor: Executor, threads: int = 1) -> dict[
         "wall_s": round(wall, 1),
         "cpu_s": round(cpu, 1),
         "main_thread_cpu_s": round(main_thread, 1),
-        "physics_share_of_cpu": round(physics.seconds / cpu, 3),
-        "physics_calls": dict(physics.calls),
+        "physics_share_of_cpu": round(phases.physics / cpu, 3),
+        "physics_calls": dict(phases.calls),
     }
 
 

@@ -28,6 +28,7 @@ from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
+from sysid_btr.io.split import split_episodes
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
@@ -246,6 +247,19 @@ def _still(replay: Replay, count: int) -> None:
         _at_start(replay, data)
         data.ctrl[:] = controls[0]
         mujoco.mj_step(replay.model, data, replay.grid.steps)
+
+
+def bare_seconds(model: str, path: Path, numerics: Numerics, seconds: float) -> float:
+    """CPU seconds of one bare `mj_step` along the first seconds of a log, the fastest of three times."""
+    robot, log = load_robot(model), read_log(path)
+    case = Case(robot, split_episodes(log)[0], numerics).first(seconds)
+    replay = Replay(robot.for_log(case.log), case.log, (), numerics, threads=1)
+    spent = []
+    for _ in range(4):
+        began = process_time()
+        _bare(replay, 1)
+        spent.append(process_time() - began)
+    return min(spent[1:]) / replay.grid.steps
 
 
 def _at_start(replay: Replay, data: Any = None) -> Any:

@@ -16,12 +16,35 @@ from typing import Any, ParamSpec, Self, TextIO, TypeVar
 P = ParamSpec("P")
 T = TypeVar("T")
 
-LINE_EVERY = 10.0
-"""Seconds between progress lines where the terminal cannot redraw one; the first one comes at once."""
+LINE_EVERY, PHASE_EVERY = 10.0, 2.0
+"""Seconds between progress lines where the terminal cannot redraw one, and before one of another phase; the first one
+comes at once."""
+USUAL_REPORTS = 10
+"""Reports of a phase that foretells no total, after which it counts as half done."""
+TOLD_FROM = 0.03
+"""Part of a run from which the time left is foretold."""
+BAR = "{desc}: {percentage:3.0f} %|{bar:20}| {elapsed}{postfix}"
 
 
-_SHOWN = ContextVar("_SHOWN", default=False)
-"""Whether a line is being shown: what runs within that run shows none of its own."""
+_SHOWN: ContextVar[ProgressLine | None] = ContextVar("_SHOWN", default=None)
+"""The line that is being shown: what runs within that run shows none of its own."""
+
+
+@contextmanager
+def phase(name: str, share: float) -> Iterator[None]:
+    """A part of a run, for the line that is shown, if any.
+
+    Parameters
+    ----------
+    name : what is done; empty where its reports say so.
+    share : expected fraction of the time of what encloses it, or of what is left of that.
+    """
+    line = _SHOWN.get()
+    if line is None:
+        yield
+        return
+    with line.phase(name, share):
+        yield
 
 
 class Interrupted(BaseException):
@@ -48,11 +71,28 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
 
 
+def mention(note: str, done: float) -> None:
+    """Say what is done and which fraction of the phase, on the line that is shown, if any: where no search reports."""
+    line = _SHOWN.get()
+    if line is not None:
+        line.mention(note, done)
+
+
+@dataclass(frozen=True)
+class _Span:
+    """A phase, as fractions of the run."""
+
+    name: str
+    begin: float
+    end: float
+
+
 @dataclass
 class ProgressLine:
     """Progress on stderr: one line that is redrawn, or a line now and then where that is impossible.
 
-    A search that follows another counts on: `done` is the sum over the searches of a run.
+    A search that follows another counts on: the count is the sum over the searches of a run. How much of a run is done
+    follows from its phases (`phase`), and the time left from that.
     """
 
     title: str
@@ -60,18 +100,22 @@ class ProgressLine:
     enabled: bool = True
     best: float = float("inf")
     _bar: Any = None
-    _before_it: Token[bool] | None = None
+    _before_it: Token[ProgressLine | None] | None = None
     _before: int = 0
     _last: int = 0
     _begun: float = field(default_factory=time.monotonic)
     _spoken: float = float("-inf")
+    _spans: list[_Span] = field(default_factory=lambda: [_Span("", 0.0, 1.0)])
+    _finished: float = 0.0
+    _reports: int = 0
+    _fraction: float = 0.0
 
     def __enter__(self) -> Self:
-        self._before_it = _SHOWN.set(True)
+        self._before_it = _SHOWN.set(self)
         if self.enabled and (self.stream.isatty() or in_notebook()):
             from tqdm import tqdm
 
-            self._bar = tqdm(desc=self.title, unit=" replays", file=self.stream, leave=False, smoothing=0.1)
+            self._bar = tqdm(desc=self.title, total=100, file=self.stream, leave=False, bar_format=BAR)
         return self
 
     def __exit__(
@@ -82,32 +126,62 @@ class ProgressLine:
         if self._before_it is not None:
             _SHOWN.reset(self._before_it)
 
+    @contextmanager
+    def phase(self, name: str, share: float) -> Iterator[None]:
+        """See `progress.phase`."""
+        end = self._finished + share * (self._spans[-1].end - self._finished)
+        self._spans.append(_Span(name, self._finished, end))
+        self._reports = 0
+        self._show((), "", PHASE_EVERY)
+        try:
+            yield
+        finally:
+            self._spans.pop()
+            self._finished, self._reports = end, 0
+
+    def mention(self, note: str, done: float) -> None:
+        """See `progress.mention`."""
+        self._advance(done)
+        self._show((), note, LINE_EVERY)
+
     def __call__(self, *, done: int, total: int | None, best: float, note: str) -> None:
         """Report; the contract of `sysid_btr.estimators.base.Progress`."""
         if done < self._last:
             self._before += self._last
         self._last = done
+        self._reports += 1
         self.best = best if math.isfinite(best) else self.best
-        count = self._before + done
-        if self._bar is not None:
-            self._bar.total = None if total is None else self._before + total
-            self._bar.n = count
-            self._bar.set_postfix_str(", ".join((*_loss(best), *((note,) if note else ()))))
-        elif self.enabled and time.monotonic() - self._spoken >= LINE_EVERY:
-            self._spoken = time.monotonic()
-            self._say(count, total, best, note)
+        if total or len(self._spans) > 1:
+            self._advance(done / total if total else self._reports / (self._reports + USUAL_REPORTS))
+        self._show(_loss(best), note, LINE_EVERY)
 
-    def _say(self, count: int, total: int | None, best: float, note: str) -> None:
-        elapsed = time.monotonic() - self._begun
-        rate = count / elapsed if elapsed > 0 else 0.0
-        parts = [f"{self.title}: {count} replays", f"{elapsed:.0f} s", *_loss(best)]
-        if total is not None and rate > 0:
-            left = max(total - self._last, 0) / rate
-            parts.insert(2, f"about {left:.0f} s left")
-        if note:
-            parts.append(note)
-        self.stream.write(", ".join(parts) + "\n")
-        self.stream.flush()
+    def _advance(self, done: float) -> None:
+        """Take a fraction of the present phase for done."""
+        span = self._spans[-1]
+        self._fraction = max(self._fraction, span.begin + min(done, 1.0) * (span.end - span.begin))
+
+    def _show(self, loss: tuple[str, ...], note: str, every: float) -> None:
+        count, elapsed = self._before + self._last, time.monotonic() - self._begun
+        doing = ": ".join(filter(None, (self._spans[-1].name, note)))
+        left: tuple[str, ...] = ()
+        if self._fraction >= TOLD_FROM:
+            left = (f"about {_duration(elapsed * (1 / self._fraction - 1))} left",)
+        if self._bar is not None:
+            self._bar.n = round(100 * self._fraction)
+            self._bar.set_postfix_str(", ".join((f"{count} replays", *left, *loss, *filter(None, (doing,)))))
+        elif self.enabled and time.monotonic() - self._spoken >= every:
+            self._spoken = time.monotonic()
+            percent = (f"{100 * self._fraction:.0f} %",) if self._fraction else ()
+            parts = (*percent, f"{count} replays", f"{elapsed:.0f} s", *left, *loss, *filter(None, (doing,)))
+            self.stream.write(f"{self.title}: {', '.join(parts)}\n")
+            self.stream.flush()
+
+
+def _duration(seconds: float) -> str:
+    """A time to wait, no more exact than it can be foretold."""
+    if seconds < 100:
+        return f"{float(f'{seconds:.1g}' if seconds < 10 else f'{seconds:.2g}'):.0f} s"
+    return f"{seconds / 60:.0f} min"
 
 
 class Watched:
@@ -131,7 +205,7 @@ def shows_progress(title: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
             told = kwargs.get("progress", watched) is not watched
-            if told or _SHOWN.get() or not (_is_terminal(sys.stderr) or in_notebook()):
+            if told or _SHOWN.get() is not None or not (_is_terminal(sys.stderr) or in_notebook()):
                 return function(*args, **kwargs)
             with ProgressLine(title) as line:
                 kwargs["progress"] = line

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -272,12 +272,7 @@ def test_mistakes_are_told_before_the_work(cli: Cli, asked: tuple[str, ...], arg
 def test_a_missing_package_is_named_with_its_extra(
     cli: Cli, asked: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def missing(name: str) -> Any:
-        if name == "corner":
-            raise ModuleNotFoundError("No module named 'corner'", name="corner")
-        return import_module(name)
-
-    monkeypatch.setattr("sysid_btr.optional.import_module", missing)
+    monkeypatch.setattr("sysid_btr.optional.find_spec", lambda name: None if name == "corner" else find_spec(name))
     answer = cli("posterior", *asked, "--out", tmp_path / "o")
     assert answer.code == 2
     assert "sysid-btr[posterior]" in answer.err

@@ -28,7 +28,8 @@ from toys import (
 )
 
 from sysid_btr.errors import ModelError
-from sysid_btr.identify.numerics import choose_numerics
+from sysid_btr.identify.episode import Procedure
+from sysid_btr.identify.numerics import CHECK_SECONDS, choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.simulation import mujoco_batch
 from sysid_btr.simulation import replay as replay_module
@@ -265,6 +266,32 @@ def test_the_step_is_chosen_by_its_effect_on_the_log() -> None:
         assert change < 0.02
         assert (numerics.timestep >= 0.005) is coarse
         assert 0.01 / numerics.timestep == pytest.approx(round(0.01 / numerics.timestep))
+
+
+def test_the_step_is_chosen_on_a_short_stretch_in_which_joints_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    swinging = swing(seconds=30.0)
+    resting = np.full(2000, swinging.channels["command.arm"][0])
+    command = np.concatenate([resting, swinging.channels["command.arm"]])
+    late = make_log(np.arange(len(command)) * 0.01, {"command.arm": command})
+    q = position(pendulum(), late, numerics=Numerics("RK4", 0.0025))[:, 0]
+    q = q + np.random.default_rng(0).normal(scale=1e-6, size=len(q))
+    late = replace(late, channels={**late.channels, "position.arm": q})
+    simulated: list[float] = []
+    predict = Replay.predict
+
+    def counted(replay: Replay, candidates: Any) -> Any:
+        simulated.append(len(candidates) * float(replay.log.time[-1] - replay.log.time[0]))
+        return predict(replay, candidates)
+
+    monkeypatch.setattr(Replay, "predict", counted)
+    assert choose_numerics(pendulum(), late.window(0, 2000))[0].timestep == pytest.approx(0.01), "a rest tells nothing"
+    assert choose_numerics(pendulum(), late)[0].timestep < 0.006
+    assert max(simulated) < 20.0 + CHECK_SECONDS + 1.0
+
+
+def test_derivatives_of_a_held_servo_come_from_steps_that_the_engine_takes_by_itself() -> None:
+    cheap = Procedure().cheap(Numerics("RK4", 0.001, 0.004))
+    assert cheap == Numerics("Euler", 0.004)
 
 
 def test_a_servo_that_no_step_can_hold_is_told() -> None:

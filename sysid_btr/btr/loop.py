@@ -40,6 +40,7 @@ from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Te
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.models.robot import Robot as RobotModel
 from sysid_btr.models.ties import as_logged
+from sysid_btr.progress import phase
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Terms
 from sysid_btr.units import probability
@@ -151,7 +152,9 @@ class _Loop:
         began = perf_counter()
         reason, finished = "", True
         for number in range(1, self.settings.iterations + 1):
-            self.rounds.append(self._round(number))
+            self.progress(done=0, total=None, best=np.inf, note=f"iteration {number}")
+            with phase("", 1 / (self.settings.iterations - number + 1)):
+                self.rounds.append(self._round(number))
             self.say(_line(self.rounds[-1]))
             best = self.rounds[-1].best
             if self.settings.requirement is not None and best >= self.settings.requirement:

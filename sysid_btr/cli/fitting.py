@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -56,8 +57,9 @@ class Keeper:
         """What is kept of a run that was interrupted."""
         if self.folder is None:
             return "interrupted; without --out nothing is kept"
+        at = f" at loss {progress.best:.4g}" if math.isfinite(progress.best) else ""
         return (
-            f"interrupted at loss {progress.best:.4g}; {self.journal.evaluations} replays are kept in "
+            f"interrupted{at}; {self.journal.evaluations} replays are kept in "
             f"{self.folder.journal}: repeat the command with --resume to continue"
         )
 

@@ -74,8 +74,10 @@ def posterior(options: PosteriorOptions) -> int:
         choose_priors(terms.parameters, options.priors, robot.priors)
         walkers_for(len(terms.parameters), options.walkers)
         rng = generator(options.seed)
+        with progress.phase("fit", 0.2):
+            found = search(study, terms, rng, journal, progress)
         return draw_posterior(
-            search(study, terms, rng, journal, progress),
+            found,
             priors=options.priors,
             settings=Settings(ensembles=options.ensembles, walkers=options.walkers),
             rng=rng,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from sysid_btr.cli.kinds import Numbers
 from sysid_btr.cli.options import option
 from sysid_btr.cli.terminal import print_json, remark
 from sysid_btr.errors import UsageError
+from sysid_btr.progress import ProgressLine
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
@@ -101,24 +103,28 @@ def _compare(
     from sysid_btr.objectives.targets import COMPARED
 
     threads = options.threads
-    study = make_study(
-        robot,
-        logs,
-        holdout=logs,
-        channels=COMPARED,
-        numerics=numerics,
-        simulator=options.simulator,
-        mode=Mode(options.mode, options.segments),
-        threads=threads,
-    )
-    scores, whole = score_problem(study.train_problem(model), model.values), open_loop_scores(study, model)
-    for path, one in zip(targets, logs, strict=False):
-        own = [episode for episode in study.train if episode.log.path == one.path]
-        if all(episode.procedure.replayed for episode in own):
-            predicted = replay_log(robot, one, model, numerics=study.numerics, threads=threads)
-        else:
-            predicted = predicted_log(own, model, study.numerics, threads=threads)
-        write_log(predicted, path, overwrite=options.overwrite)
+    with ProgressLine("replay") as progress:
+        study = make_study(
+            robot,
+            logs,
+            holdout=logs,
+            channels=COMPARED,
+            numerics=numerics,
+            simulator=options.simulator,
+            mode=Mode(options.mode, options.segments),
+            threads=threads,
+            progress=progress,
+        )
+        with progress.phase("replay of the logs", 0.6):
+            scores, whole = score_problem(study.train_problem(model), model.values), open_loop_scores(study, model)
+        for number, (path, one) in enumerate(zip(targets, logs, strict=False)):
+            progress(done=number, total=len(targets), best=math.inf, note=f"prediction of {one.path}")
+            own = [episode for episode in study.train if episode.log.path == one.path]
+            if all(episode.procedure.replayed for episode in own):
+                predicted = replay_log(robot, one, model, numerics=study.numerics, threads=threads)
+            else:
+                predicted = predicted_log(own, model, study.numerics, threads=threads)
+            write_log(predicted, path, overwrite=options.overwrite)
     result = replay_result(study, scores, dict(options.set), time.perf_counter() - began, whole)
     if options.json:
         print_json(result)

@@ -25,7 +25,7 @@ from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import Study
 from sysid_btr.io._text import some
 from sysid_btr.io.noise import is_white
-from sysid_btr.progress import shows_progress, watched
+from sysid_btr.progress import phase, shows_progress, watched
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import COMMANDS, GROUND, Effect
 from sysid_btr.terms.free_form import FREE_FORMS
@@ -80,11 +80,14 @@ def close(
         asked = (*asked, *FREE_FORMS)
     require_motion(study)
     while True:
-        first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
+        with phase("fit", 0.2):
+            first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
         state = State.of(first, journal)
         library = usable_effects(asked, study)
-        state = search(state, library, selection, progress)
-        state = with_discrepancy(eliminate(state, library, selection, progress))
+        with phase("search", 0.7):
+            state = search(state, library, selection, progress)
+        with phase("elimination", 0.8):
+            state = with_discrepancy(eliminate(state, library, selection, progress))
         floating = state.study.procedure.leaves_ground_error
         named = named_effects(state, selection)
         verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)

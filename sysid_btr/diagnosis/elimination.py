@@ -25,7 +25,7 @@ from sysid_btr.diagnosis.selection import (
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt
 from sysid_btr.diagnosis.uncertainty import with_intervals
-from sysid_btr.estimators.base import Progress
+from sysid_btr.estimators.base import Progress, without_loss
 from sysid_btr.identify.refit import inflate, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import Effect
@@ -52,7 +52,7 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
             break
     study = inflate(state.study, state.fitted, memory=True)
     progress(done=state.replays, total=None, best=nan, note="final fit")
-    polished = refit(study, state.fitted.model, polish=True, progress=progress)
+    polished = refit(study, state.fitted.model, polish=True, progress=without_loss(progress))
     state = replace(state, study=study, fitted=polished).spent(polished.evaluations)
     progress(done=state.replays, total=None, best=nan, note="intervals")
     state = with_intervals(state, rules)

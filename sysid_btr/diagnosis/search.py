@@ -23,9 +23,12 @@ from sysid_btr.diagnosis.trials import (
 )
 from sysid_btr.estimators.base import Progress
 from sysid_btr.identify.refit import refit, robust_refit
+from sysid_btr.progress import phase
 from sysid_btr.terms.free_form import FREE_FORMS
 
 Say = Callable[[str], None]
+ROUND_SHARE = 0.35
+"""Expected fraction of a round in what is left of a search."""
 
 
 def search(state: State, library: Library, rules: Selection, progress: Progress) -> State:
@@ -39,7 +42,8 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             so_far = f"(so far {at.fitted.holdout:.4g})"
             progress(done=at.replays, total=None, best=nan, note=f"round {number}: {note} {so_far}")
 
-        state, trials = _try_promising(state, library, rules, say)
+        with phase("", ROUND_SHARE):
+            state, trials = _try_promising(state, library, rules, say)
         worthy = [t for t in trials if _is_worthy(rules, state, t)]
         winner = choose(rules, now, worthy)
         told = candidates_of(rules, now, trials, winner, number)

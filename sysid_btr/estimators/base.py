@@ -117,6 +117,15 @@ class Progress(Protocol):
         ...
 
 
+def without_loss(progress: Progress) -> Progress:
+    """For searches whose loss is not that of the run: with other weights, or of other data."""
+
+    def told(*, done: int, total: int | None, best: float, note: str) -> None:
+        progress(done=done, total=total, best=np.nan, note=note)
+
+    return told
+
+
 def silent(*, done: int, total: int | None, best: float, note: str) -> None:
     """Progress that reports nothing."""
 

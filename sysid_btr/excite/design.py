@@ -422,6 +422,7 @@ def design(
         The model has no servo, or diverges.
     """
     began = perf_counter()
+    progress(done=0, total=None, best=np.inf, note="first motion")
     robot = configured(robot, reference)
     rng = np.random.default_rng(0) if rng is None else rng
     motion = motion or MotionSettings()

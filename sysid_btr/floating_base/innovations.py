@@ -55,6 +55,7 @@ from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.marginal import Projection
 from sysid_btr.objectives.problem import BLOCK, Comparison
 from sysid_btr.objectives.targets import Target
+from sysid_btr.progress import mention, phase
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import BASE, BaseStates, Segments
 from sysid_btr.terms.base import Outputs, Term
@@ -402,7 +403,8 @@ class InnovationsEpisode(Episode):
         n = len(self.log)
         chain, known = found.chain.part(0, n), found.known.part(0, n)
         chain = replace(chain, steps=replace(chain.steps, terms=replay.terms, numerics=coarse, threads=replay.threads))
-        chain, known = follow_states(chain, known, values, ROUNDS)
+        with phase("states of the base", 0.1):
+            chain, known = follow_states(chain, known, values, ROUNDS)
         return replace(found, chain=chain, known=known, filter=filter_at(chain, known, values))
 
     def _begun(self, numerics: Numerics, threads: int) -> Self:
@@ -421,7 +423,8 @@ class InnovationsEpisode(Episode):
                     f"states as measured, with steps of {1e3 * numerics.timestep:.3g} ms. Check armature and masses: a "
                     "body without mass is the usual cause."
                 )
-            chain, known = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
+            with phase("states of the base", 0.9):
+                chain, known = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
             return chain, known, filter_at(chain, known, terms.nominal)
 
         key = ("innovations", self.robot.fingerprint, self.robot.at, numerics)
@@ -459,6 +462,7 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
     terms = Terms(chain.steps.terms)
     numbers, step = np.arange(len(values)), NUDGE_NUMBER * (terms.upper - terms.lower)
     for k in range(rounds):
+        mention(f"round {k + 1} of {rounds}", k / rounds)
         # how large jolts are is told once states have moved, at the numbers that suit them best
         sized = slice(None if k == rounds - 2 else 0)
         ends = simulate_chain(chain, values, numbers[sized], step[sized])

@@ -116,6 +116,9 @@ class Procedure:
 
     def cheap(self, numerics: Numerics) -> Numerics:
         """Integrator and step of derivatives: a fraction of the cost, and as far off as a step of first order is."""
+        if numerics.servo_period:
+            # the engine takes these steps by itself
+            return replace(numerics, integrator="Euler", timestep=numerics.servo_period, servo_period=None)
         return replace(numerics, integrator="implicitfast") if numerics.integrator == "RK4" else numerics
 
     def stencil(self, terms: Terms) -> float:

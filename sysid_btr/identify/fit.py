@@ -11,13 +11,13 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, uses_residuals
+from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress, Termination, uses_residuals, without_loss
 from sysid_btr.estimators.chain import Chain, needs_residuals
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.bounds import grow_bounds
 from sysid_btr.identify.coarse import realise_servo, weigh_columns
-from sysid_btr.identify.deferred import deferred_fit
+from sysid_btr.identify.deferred import corrected, deferred_fit
 from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fixing import fix_unidentifiable
@@ -31,7 +31,7 @@ from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import channel_units
 from sysid_btr.objectives.distance import Distance, DistanceProblem
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.progress import shows_progress, watched
+from sysid_btr.progress import phase, shows_progress, watched
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model, Terms
 from sysid_btr.units import si_all
@@ -184,14 +184,17 @@ def fit(
     model = Model.of(terms, terms.begin if start is None else start)
     budget = budget or Budget()
     search = _Search(estimator, distance, rng, budget, Journal() if journal is None else journal, progress)
-    solved = search.run(realise_servo(study, model), model)
+    with phase("search", 0.7):
+        solved = search.run(realise_servo(study, model), model)
     study, replays = solved.study, solved.replays
     at = Optimum.of(solved.problem, solved.result, study.stencil(terms))
     if solved.by_residuals:
-        at, spent = grow_bounds(study, at, rng, budget.after(replays), progress)
-        model, replays = at.problem.model, replays + spent
-        study, at, shift, spent = with_short_steps(study, model, at, rng, budget.after(replays), progress)
-        replays += spent
+        with phase("bounds", 0.2):
+            at, spent = grow_bounds(study, at, rng, budget.after(replays), progress)
+            model, replays = at.problem.model, replays + spent
+        with phase("half the step", 0.3):
+            study, at, shift, spent = with_short_steps(study, model, at, rng, budget.after(replays), progress)
+            replays += spent
     else:
         shift = at.shift
     problem, values, jacobian, residual = at.problem, at.values, at.jacobian, at.residual
@@ -203,11 +206,15 @@ def fit(
     beyond = np.hypot(shift, error_of_the_rest(study, problem.model.at(at.values), at.jacobian))
     found = estimates(problem.parameters, values, jacobian, residual, problem.blocks, beyond, known)
     if solved.by_residuals:
-        if known is None and solved.result.termination is not Termination.BUDGET_SPENT:
-            found, spent = followed(problem.parameters, found, problem, values, jacobian)
+        with phase("intervals", 0.7):
+            if known is None and solved.result.termination is not Termination.BUDGET_SPENT:
+                # how fast the loss rises hardly depends on the integrator, but where teeth meet
+                same = terms.structural or study.cheap == study.numerics
+                near = problem if same else corrected(problem, study.cheap, values)
+                found, spent = followed(problem.parameters, found, near, values, jacobian)
+                replays += spent
+            values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))
             replays += spent
-        values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))
-        replays += spent
     before = score(study, model.at(values))
     if misfit_of(before.train, study.leading_channel, study.procedure.tolerated) is not None:
         found = widened(found, problem, at.values, jacobian, residual, study.scales)
@@ -272,7 +279,9 @@ class _Search:
             goal = problem if self.distance is None else DistanceProblem(problem, self.distance)
             result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
             return _Solved(study, problem, result, result.evaluations + spent, False)
-        study, coarse = weigh_columns(study, model.at(problem.start), budget, progress)
+        with phase("first fit", 0.5):
+            # columns get their weights here: its loss is another one
+            study, coarse = weigh_columns(study, model.at(problem.start), budget, without_loss(progress))
         budget = budget.after(coarse.evaluations)
         problem, spent = study.train_problem(coarse.model), spent + coarse.evaluations
         if study.procedure.deferred:

@@ -170,18 +170,18 @@ def estimates(
     numerics_shift : (p,) change of the estimates when the step is halved, if known.
     known : all that is known of some of them, from these residuals and from elsewhere.
     """
-    from scipy.stats import t as student
+    from scipy.special import stdtrit  # quantiles of Student's t; scipy.stats takes a second to import
 
     cov, dof = spread(jacobian, residual, blocks)
     std = np.sqrt(np.diag(cov))
     if numerics_shift is not None:
         std = np.hypot(std, np.abs(numerics_shift))
-    quantile = np.asarray(student.ppf(0.975, dof))
+    quantile = np.asarray(stdtrit(dof, 0.975))
     if known is not None:
         std[known.which] = np.sqrt(np.diag(known.covariance))
         cov[known.which], cov[:, known.which] = 0.0, 0.0
         cov[np.ix_(known.which, known.which)] = known.covariance
-        quantile[known.which] = student.ppf(0.975, np.inf)
+        quantile[known.which] = stdtrit(np.inf, 0.975)
     norm = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
     together = correlations(cov)
     result = []

@@ -25,7 +25,7 @@ from sysid_btr.models.ties import as_logged
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, FITTED, WARM_UP
-from sysid_btr.progress import shows_progress, watched
+from sysid_btr.progress import phase, shows_progress, watched
 from sysid_btr.simulation.compiling import make_index
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.registry import on_simulator
@@ -36,6 +36,8 @@ from sysid_btr.terms.model import Model, Terms, as_model
 from sysid_btr.terms.scales import JointScale, Scales
 
 TINY = 1e-9
+FIXED_SHARE, FLOATING_SHARE = 0.05, 0.4
+"""Of the time of a fit, what it takes to lay it out: on a floating base states are estimated."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -232,35 +234,37 @@ def make_study(
     require_drives(robot, logs)
     robot = as_logged(robot, logs)
     given = on_simulator(numerics or Numerics("RK4", 0.005), simulator)
-    recordings = [e for log in logs for e in split_episodes(log)]
-    if isinstance(holdout, int | float):
-        _refuse_repeats(recordings)
-        parts = [split_episode(robot, e, float(holdout), mode, threads) for e in recordings]
-        train, held = [fitted for fitted, _ in parts], [left for _, left in parts]
-    else:
-        judged = [e for log in holdout for e in split_episodes(log)]
-        if holdout is not logs:
-            _refuse_repeats((*recordings, *judged))
-        train = [episode_of(robot, e, mode, threads) for e in recordings]
-        held = [episode_of(robot, e, mode, threads) for e in judged]
-    study = Study(
-        robot=robot,
-        train=tuple(train),
-        holdout=tuple(held),
-        channels=tuple(c for c in COMPARED if c in channels),
-        numerics=given,
-        numerics_error=np.nan,
-        threads=threads,
-        executor=executor,
-        nuisance=nuisance or {},
-    )
-    if numerics is None:
-        say(note="choosing the integrator's step")
-        leading = max(train, key=lambda e: e.procedure.demand)
-        chosen, error = leading.choose_numerics(threads, given.simulator)
-        study = replace(study, numerics=chosen, numerics_error=error)
-    say(note="initial states")
-    return study.with_initial_states(Model.of(()))
+    floating = any(log.meta.mount == "free" for log in logs)
+    with phase("study", FLOATING_SHARE if floating else FIXED_SHARE):
+        recordings = [e for log in logs for e in split_episodes(log)]
+        if isinstance(holdout, int | float):
+            _refuse_repeats(recordings)
+            parts = [split_episode(robot, e, float(holdout), mode, threads) for e in recordings]
+            train, held = [fitted for fitted, _ in parts], [left for _, left in parts]
+        else:
+            judged = [e for log in holdout for e in split_episodes(log)]
+            if holdout is not logs:
+                _refuse_repeats((*recordings, *judged))
+            train = [episode_of(robot, e, mode, threads) for e in recordings]
+            held = [episode_of(robot, e, mode, threads) for e in judged]
+        study = Study(
+            robot=robot,
+            train=tuple(train),
+            holdout=tuple(held),
+            channels=tuple(c for c in COMPARED if c in channels),
+            numerics=given,
+            numerics_error=np.nan,
+            threads=threads,
+            executor=executor,
+            nuisance=nuisance or {},
+        )
+        if numerics is None:
+            say(note="choosing the integrator's step")
+            leading = max(train, key=lambda e: e.procedure.demand)
+            chosen, error = leading.choose_numerics(threads, given.simulator)
+            study = replace(study, numerics=chosen, numerics_error=error)
+        say(note="initial states")
+        return study.with_initial_states(Model.of(()))
 
 
 def _refuse_repeats(recordings: Iterable[Log]) -> None:

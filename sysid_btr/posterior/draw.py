@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget, Progress
+from sysid_btr.estimators.base import Budget, Progress, without_loss
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import Estimate, correlations, identifiability
@@ -21,7 +21,7 @@ from sysid_btr.posterior.outcome import Posterior
 from sysid_btr.posterior.predictive import coverage, predict_bands
 from sysid_btr.posterior.priors import choose_priors
 from sysid_btr.posterior.sampling import Sample, Settings, sample
-from sysid_btr.progress import shows_progress, watched
+from sysid_btr.progress import phase, shows_progress, watched
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -75,18 +75,20 @@ def posterior(
     problem = fit.study.train_problem(fit.model)
     x, residual, jacobian, extra = settle(problem, fit.model.values, fit.study.stencil(fit.model.terms))
     likelihood = make_likelihood(problem, x, residual, jacobian, problem.blocks, fit.numerics_shift)
-    drawn = sample(
-        replace(problem, start=x),
-        likelihood,
-        chosen,
-        settings=settings or Settings(),
-        rng=np.random.default_rng(0) if rng is None else rng,
-        budget=budget or BUDGET,
-        journal=Journal() if journal is None else journal,
-        progress=progress,
-    )
+    with phase("draws", 0.95):
+        drawn = sample(
+            replace(problem, start=x),
+            likelihood,
+            chosen,
+            settings=settings or Settings(),
+            rng=np.random.default_rng(0) if rng is None else rng,
+            budget=budget or BUDGET,
+            journal=Journal() if journal is None else journal,
+            progress=without_loss(progress),
+        )
     values = drawn.flat.mean(axis=0)
-    bands = predict_bands(fit.study, fit.model.at(values), drawn.thinned(PREDICTIVE_DRAWS))
+    with phase("predictions", 0.9):
+        bands = predict_bands(fit.study, fit.model.at(values), drawn.thinned(PREDICTIVE_DRAWS))
     return Posterior(
         fit=fit,
         priors=chosen,

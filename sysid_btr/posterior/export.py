@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr.optional import optional
+from sysid_btr.optional import optional, require
 from sysid_btr.version import __version__
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ def check_installed() -> None:
     UsageError
         A package of the extra ``posterior`` is missing.
     """
-    for module in ("emcee", "arviz_base", "arviz_stats.base", "h5netcdf", "corner"):
-        optional(module, "posterior", "a posterior")
+    for package in ("emcee", "arviz_base", "arviz_stats", "h5netcdf", "corner"):
+        require(package, "posterior", "a posterior")
 
 
 def to_datatree(posterior: Posterior) -> Any:

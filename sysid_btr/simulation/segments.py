@@ -207,12 +207,12 @@ class _Frame:
     late: float
     """s from the first border to the first sample."""
 
-    @property
+    @cached_property
     def steps(self) -> int:
         """Steps to its last sample."""
         return max(int(self.after[-1]), 1)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """The same for segments that are worth simulating to the longest one's end."""
         return int(np.ceil(np.log(self.steps) / np.log(1 / WORTH)))
@@ -323,22 +323,23 @@ class SegmentReplay(Replay):
         pairs = self._values(candidates)
         # a torque known in advance is known on the log's clock, so its segments cannot share a batch
         alone = any(type(term).overrides("applied_torque") for term, _ in pairs)
-        groups: dict[int, list[int]] = {}
-        for i in sorted(range(len(segment)), key=lambda i: self._clock[segment[i]]):
-            groups.setdefault(int(segment[i]) if alone else self._frames[segment[i]].size, []).append(i)
-        for members in groups.values():
-            steps = max(self._frames[segment[i]].steps for i in members)
+        order = np.argsort(self._clock[segment], kind="stable")
+        label = segment if alone else np.array([frame.size for frame in self._frames])[segment]
+        labels, begins = np.unique(label[order], return_index=True)
+        for own_label in labels[np.argsort(begins)]:
+            members = order[label[order] == own_label]
+            steps = max(self._frames[w].steps for w in np.unique(segment[members]))
             most = max(SIMULATIONS, CHUNK_DOFS // max(self.model.nv, 1), STEPS // steps)
             for first in range(0, len(members), most):
-                sims = np.array(members[first : first + most])
+                sims = members[first : first + most]
                 own = [(term, values[row[sims]]) for term, values in pairs]
                 yield from self._block(own, sims, segment[sims], None if change is None else change[sims])
 
     @cached_property
-    def _clock(self) -> list[int]:
+    def _clock(self) -> IntArray:
         """Of each segment, the first one with the same sample times."""
         first: dict[object, int] = {}
-        return [first.setdefault(frame.key, w) for w, frame in enumerate(self._frames)]
+        return np.array([first.setdefault(frame.key, w) for w, frame in enumerate(self._frames)], dtype=np.int64)
 
     def _block(
         self, pairs: Values, sims: IntArray, segment: IntArray, change: FloatArray | None
@@ -347,8 +348,7 @@ class SegmentReplay(Replay):
         h, steps = self.grid.timestep, max(self._frames[w].steps for w in segment)
         setup = self._setup(pairs, segment, change, steps)
         states = self.simulate(setup, np.arange(steps + 1))
-        clock = np.array([self._clock[w] for w in segment])
-        borders = np.flatnonzero(np.diff(clock, prepend=-1, append=-1))
+        borders = np.flatnonzero(np.diff(self._clock[segment], prepend=-1, append=-1))
         for a, b in pairwise(borders):
             frame, rows = self._frames[segment[a]], slice(int(a), int(b))
             local = Grid(
@@ -369,15 +369,14 @@ class SegmentReplay(Replay):
 
     def _setup(self, pairs: Values, segment: IntArray, change: FloatArray | None, steps: int) -> Setup:
         """Segments from their initial states, with `change` added to these."""
-        h, frames = self.grid.timestep, [self._frames[w] for w in segment]
+        h = self.grid.timestep
         starts = self._segments.chosen(segment)
         if change is not None:
             starts = starts.moved(change[:, : starts.std.shape[1]])
-        late = np.array([frame.late for frame in frames])
+        first, late = (np.array([getattr(frame, n) for frame in self._frames])[segment] for n in ("first", "late"))
         if late.any():
             starts = starts.late(late)
         batch = self.batch(pairs, len(segment))
-        first = np.array([frame.first for frame in frames])
         lead = round(self.lead / h)
         rows = np.clip(first[:, None] + np.arange(-lead, steps), 0, self.grid.steps - 1)
         setup = prepare(

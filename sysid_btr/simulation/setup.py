@@ -181,12 +181,12 @@ def lagged(batch: BatchModel, command: FloatArray) -> FloatArray:
     Exact for held commands: the mean over each step of u + (y - u) exp(-t / T), where y is the filter's output at its
     beginning.
     """
-    from scipy.signal import lfilter
-
     driven = np.flatnonzero(batch.index.actuator >= 0)
     constant = batch.read("actuator_dynprm")[:, batch.index.actuator[driven], 0]
     if not np.any(constant > 0):
         return command
+    from scipy.signal import lfilter
+
     shaped = np.array(np.broadcast_to(command, (batch.size, *command.shape[1:])))
     for drive, joint in enumerate(driven):
         for own in np.unique(constant[constant[:, drive] > 0, drive]):
