@@ -173,8 +173,8 @@ class Selection:
     148 logs of another engine the right ones left up to 1.3 % (2.3 % where one of two was missed), and what imitated
     another effect 2.9 % or more."""
     explained_most: float = 5.0
-    """Chi2 that may be left, at most, beyond which more than noise is left, however much is gone. benchmarks/blind: the right
-    ones of 142 logs that are explained left up to 4.0, 98 % of them up to 1.3."""
+    """Chi2 beyond which more than noise is left, however much is gone. benchmarks/blind: on 142 logs that were
+    explained, rightly, up to 4.0 was left, on 98 % of them up to 1.3."""
     explained_floating: float = 0.85
     """The same for floating bases: the ground leaves more. Judgement."""
     floor_verdict: float = 1.10
