@@ -43,9 +43,9 @@ STARTS = 5
 LATEST = 0.8
 """Fraction of a log before which they lie: what is left after them must be long enough to tell."""
 KEPT = 0.25
-"""Fraction of the time over which replays are linear that a segment lasts: a model that lacks something errs by more
-than the changes that are tried. Thin: on one simulated log (friction undeclared) the worst estimate was off by 1.5 %
-over all of that time and by 1.0 % over a quarter; on two measured logs together the former did not converge."""
+"""Fraction of the time over which replays are linear that a segment lasts at most: a fit tries changes that are larger
+than those. Thin: on one simulated log (friction undeclared) the worst estimate was off by 1.5 % over all of that time
+and by 1.0 % over a quarter; on two measured logs together the former did not converge."""
 SHARES = (1 / 4, 1.0, 1.0)
 """Lengths of segment in first fits, as fractions of the one that is chosen."""
 MOVES = 3
@@ -101,7 +101,7 @@ class SegmentedEpisode(Episode):
             If no joint's position is logged.
         """
         tracks = measured_motion(robot, log)
-        length = KEPT * follow(robot, log, threads).seconds if seconds is None else seconds
+        length = follow(robot, log, threads).seconds if seconds is None else seconds
         every = np.ones(len(log), dtype=bool)
         return cls(robot, log, every, tracks, _cut(log, tracks, length, 0, len(log)), length)
 
@@ -118,7 +118,7 @@ class SegmentedEpisode(Episode):
         """
         count = len(holdout_split(log, holdout)[0])
         tracks, fitted = measured_motion(robot, log), np.arange(len(log)) < count
-        length = KEPT * follow(robot, log, threads).seconds if seconds is None else seconds
+        length = follow(robot, log, threads).seconds if seconds is None else seconds
         parts = ((fitted, 0, count), (~fitted, count, len(log)))
         first, last = (cls(robot, log, own, tracks, _cut(log, tracks, length, a, b), length) for own, a, b in parts)
         return first, last
@@ -221,7 +221,7 @@ class Followed:
 
     Attributes
     ----------
-    seconds : for how long half of the replays from different samples are linear.
+    seconds : for how long half of the replays from different samples are well within what is linear, and near the log.
     open_loop : whether the replay of all of it is linear to its end, and no worse than to stand still.
     """
 
@@ -237,12 +237,13 @@ def follow(robot: Robot, log: Log, threads: int = 0) -> Followed:
 def _follow(robot: Robot, log: Log, threads: int) -> Followed:
     tracks, n = measured_motion(robot, log), len(log)
     first = np.linspace(0, LATEST * n, STARTS).astype(np.int64)
-    seconds, misfit = linear_seconds(
+    linear, near, misfit = linear_seconds(
         robot, log, _starts_at(tracks, np.stack([first, np.full(STARTS, n)], axis=1)), threads
     )
-    whole = seconds[0] >= log.time[-1] - log.time[0]
+    whole = linear[0] >= log.time[-1] - log.time[0]
+    seconds = float(np.median(np.minimum(KEPT * linear, near)))
     least = FEWEST * float(np.median(np.diff(log.time)))
-    return Followed(max(float(np.median(seconds)), least), bool(whole and misfit[0] <= 1.0))
+    return Followed(max(seconds, least), bool(whole and misfit[0] <= 1.0))
 
 
 def measured_motion(robot: Robot, log: Log) -> Tracks:
