@@ -207,10 +207,15 @@ def _idle(h: Hypothesis, rules: Selection) -> bool:
 
 
 def _varied(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
-    """Best first, but only some hypotheses of one effect class, so that rivals get their turn."""
+    """Best first, each once, but only some of one effect class, so that rivals get their turn."""
     taken: dict[type[Effect], int] = {}
+    known = set()
     result = []
     for hypothesis in ranked:
+        same = (hypothesis.effect, frozenset(hypothesis.places), hypothesis.shared)
+        if same in known:
+            continue
+        known.add(same)
         if taken.get(hypothesis.effect, 0) < rules.refits_of_one:
             taken[hypothesis.effect] = taken.get(hypothesis.effect, 0) + 1
             result.append(hypothesis)

@@ -174,6 +174,8 @@ class SegmentedEpisode(Episode):
         """As for a whole replay, judged over segments as short as those of first fits, their starts integrated out.
 
         What a step does wrong grows along long ones as every other error does, which a fit answers for (`step_check`).
+        It is small beside what the plain model leaves, or beside the noise where that leaves none: half a step also
+        moves the borders between which a command is held, which no step is fine enough for where a clock jitters.
         A start between two borders of steps is taken back to the first one, which is an error of the start.
         """
         if self.log.meta.servo_period:
@@ -189,8 +191,12 @@ class SegmentedEpisode(Episode):
             target = compared.targets[0]
             with silenced():
                 found = compared.errors(compared.replay.predict(plain))[0]
-            return {j: found[target.mask[:, k], k] for k, j in enumerate(target.joints)}
+            white = {j: found[target.mask[:, k], k] / target.noise[k] for k, j in enumerate(target.joints)}
+            # the size of what is left, once and for all steps
+            left.update({j: max(float(np.sqrt(np.mean(x**2))), 1.0) for j, x in white.items() if j not in left})
+            return {j: target.noise[k] * white[j] / left[j] for k, j in enumerate(target.joints)}
 
+        left: dict[str, float] = {}
         chosen, error = converged(first, errors, self.log)
         if not np.isfinite(error):
             raise ModelError(
