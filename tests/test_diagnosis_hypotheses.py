@@ -14,22 +14,7 @@ from sysid_btr.terms.scales import JointScale, Scales
 
 ROWS = 400
 JOINTS = ("shoulder", "elbow")
-SCALES: Scales = dict.fromkeys(
-    JOINTS,
-    JointScale(
-        torque_rms=1.0,
-        torque_peak=2.0,
-        velocity_rms=1.0,
-        velocity_peak=2.0,
-        acceleration_rms=1.0,
-        span=1.0,
-        slide=False,
-        measured_rms=1.0,
-        measured_peak=2.0,
-        centre=0.0,
-        seconds=10.0,
-    ),
-)
+SCALES: Scales = dict.fromkeys(JOINTS, JointScale(1.0, 2.0, 1.0, 2.0, 1.0, 1.0))
 
 
 def scanned(response: FloatArray, residual: FloatArray) -> list[Sensitivity]:

@@ -45,6 +45,7 @@ from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionLarger, StribeckFriction, ViscousDamping
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.scales import JointScale, Scales
 from sysid_btr.terms.sensing import SensorDelay
 from sysid_btr.terms.servo import CommandDelay
 
@@ -559,13 +560,15 @@ def sensitivity(
     places = (place,) if isinstance(place, str) else place
     values = np.zeros(len(effect.kinds))
     values[effect.main] = amount
-    response = np.array(direction, dtype=np.float64)[:, None]
+    response = np.sqrt(gain) * np.array(direction, dtype=np.float64)[:, None]
     perturbation = Perturbation(effect, places, ((amount,),))
-    nothing = Residual.of(np.zeros(len(response)), np.zeros((len(response), 0)))
-    return Sensitivity(perturbation, nothing, np.arange(len(response)), response, np.ones(1), gain, values)
+    # what it explains alone is all that it is asked to
+    own = Residual.of(-response[:, 0], np.zeros((len(response), 0)))
+    return Sensitivity(perturbation, own, np.arange(len(response)), response, np.ones(1), gain, values)
 
 
 HIP, KNEE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+LEG: Scales = dict.fromkeys(("hip", "knee"), JointScale(10.0, 20.0, 1.0, 2.0, 1.0, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -603,13 +606,13 @@ HIP, KNEE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     ],
 )
 def test_locations_of_a_hypothesis(found: Sequence[Sensitivity], expected: Sequence[tuple[str, ...]]) -> None:
-    assert [h.places for h in form_hypotheses(found, 3, RULES)] == list(expected)
+    assert [h.places for h in form_hypotheses(found, 3, LEG, RULES)] == list(expected)
 
 
 @pytest.mark.parametrize(("amount", "shared"), [(1.9, True), (2.1, False)])
 def test_amounts_that_nearly_agree_are_tried_as_one_too(amount: float, shared: bool) -> None:
     found = [sensitivity(SIMPLE, "hip", 1000.0, HIP), sensitivity(SIMPLE, "knee", 900.0, KNEE, amount)]
-    assert any(h.shared for h in form_hypotheses(found, 3, RULES)) is shared
+    assert any(h.shared for h in form_hypotheses(found, 3, LEG, RULES)) is shared
 
 
 @pytest.mark.parametrize(("amount", "named"), [(1.1e-3, True), (0.9e-3, False)])
@@ -618,15 +621,15 @@ def test_an_effect_that_includes_another_is_not_tried_where_it_adds_nothing(amou
     values = np.ones(len(GENERAL.kinds))
     values[GENERAL.main] = amount
     found = [replace(one, values=values), sensitivity(SIMPLE, "hip", 900.0, HIP)]
-    assert any(h.effect is GENERAL for h in form_hypotheses(found, 3, RULES)) is named
+    assert any(h.effect is GENERAL for h in form_hypotheses(found, 3, LEG, RULES)) is named
 
 
 def test_hypotheses_are_few_and_varied() -> None:
     found = [sensitivity(SIMPLE, (f"a{i}", "b"), 1000.0 - i, HIP) for i in range(5)]
     found += [sensitivity(OTHER, (f"a{i}", "b"), 500.0 - i, HIP) for i in range(5)]
-    assert [h.effect for h in form_hypotheses(found, 3, RULES)] == [SIMPLE] * 3 + [OTHER] * 3
-    assert len(form_hypotheses(found, 3, Selection(refits=2))) == 2
-    assert len(form_hypotheses(found, 3, Selection(refits_of_one=1))) == 2
+    assert [h.effect for h in form_hypotheses(found, 3, LEG, RULES)] == [SIMPLE] * 3 + [OTHER] * 3
+    assert len(form_hypotheses(found, 3, LEG, Selection(refits=2))) == 2
+    assert len(form_hypotheses(found, 3, LEG, Selection(refits_of_one=1))) == 2
 
 
 # --- verdict --------------------------------------------------------------------------------------------------

@@ -178,7 +178,7 @@ def _grow(lead: Sensitivity, candidates: Sequence[Sensitivity], residuals: int, 
     for k, one in enumerate(offered):
         explained[one.rows, k] = one.explained
     # the residual is measured minus predicted, so what explains it has the opposite sign
-    gram, target = explained.T @ explained, -explained.T @ lead.residual.rest
+    gram, target = explained.T @ explained, np.array([-one.explained @ one.residual.rest[one.rows] for one in offered])
     effect = lead.perturbation.effect
     most = max(rules.most_parameters // len(effect.kinds), 1)
     kept, group = [0], _Group((lead,), np.ones(1), lead.gain)

@@ -125,6 +125,10 @@ class Selection:
     """Weight of the model with an effect against that without it on held-out data (`evidence.preference`), from which
     it is added: it must be the more likely of the two."""
 
+    likely: float = 0.5
+    """Certainty of its name from which one more is added to effects that explain the log already (`explained`). What
+    takes up a part of what they leave is prediction and no cause; 0 adds it."""
+
     # --- which one of several ---
 
     simpler: float = 0.06
