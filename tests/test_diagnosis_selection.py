@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, NamedEffect
+from sysid_btr.diagnosis.evidence import is_likely
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity
 from sysid_btr.diagnosis.selection import (
@@ -30,6 +31,7 @@ from sysid_btr.diagnosis.selection import (
     improves_once,
     is_dispensable,
     is_explained,
+    is_log_explained,
     is_needed,
     predicts_as_well,
     something_left,
@@ -638,6 +640,24 @@ def test_hypotheses_are_few_and_varied() -> None:
 def test_the_limit_of_a_verdict_grows_with_chance() -> None:
     assert verdict_limit(RULES, 0.0) == pytest.approx(1.1)
     assert verdict_limit(RULES, 0.1) == pytest.approx(1.4)
+
+
+@pytest.mark.parametrize(
+    ("holdout", "train", "expected"), [(3.4, 3.4, True), (3.7, 3.4, False), (3.4, 3.7, False), (1.0, 1.0, True)]
+)
+def test_a_log_is_explained_where_it_is_fitted_and_where_it_is_not(
+    holdout: float, train: float, expected: bool
+) -> None:
+    now = fitted([holdout], [train])
+    assert is_log_explained(RULES, fitted([101.0]), now, floating=False) is expected
+
+
+@pytest.mark.parametrize(("left", "expected"), [(0.1, True), (0.3, True), (0.4, False), (0.7, False)])
+def test_a_name_is_likely_where_hardly_anything_is_left(left: float, expected: bool) -> None:
+    """At the least certainty with all the weight that a family can have: 0.34 of the excess is left."""
+    winner = trial(SIMPLE, fitted([1 + 99 * left]))
+    assert is_likely(RULES, fitted([100.0]), winner, [winner]) is expected
+    assert is_likely(Selection(likely=0.0), fitted([100.0]), winner, [winner])
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import nan
 
-from sysid_btr.diagnosis import certainty
 from sysid_btr.diagnosis.elimination import without_dispensable
-from sysid_btr.diagnosis.evidence import evidence_of, left_where_it_acts, preference, weights
+from sysid_btr.diagnosis.evidence import evidence_of, is_likely, preference, weights
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
 from sysid_btr.diagnosis.selection import (
     Selection,
@@ -16,8 +15,7 @@ from sysid_btr.diagnosis.selection import (
     at_floor,
     has_minimum_gain,
     improves,
-    is_explained,
-    verdict_limit,
+    is_log_explained,
 )
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import (
@@ -31,7 +29,7 @@ from sysid_btr.diagnosis.trials import (
     is_superfluous,
 )
 from sysid_btr.estimators.base import Progress
-from sysid_btr.identify.refit import Fitted, refit, robust_refit
+from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.terms.free_form import FREE_FORMS
 
 Say = Callable[[str], None]
@@ -51,7 +49,10 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
         state, trials = _try_promising(state, library, rules, say)
         worthy = [t for t in trials if _is_worthy(rules, state, t)]
         winner = choose(rules, now, worthy)
-        if winner is not None and _explains(rules, state) and not _is_likely(rules, now, winner, trials):
+        floating = state.study.procedure.leaves_ground_error
+        explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
+        # what takes up a part of what the shapes of effects leave has no name
+        if winner is not None and explained and not is_likely(rules, now, winner, trials):
             winner = None
         told = candidates_of(rules, now, trials, winner, number)
         state = replace(state, candidates=(*state.candidates, *told))
@@ -59,24 +60,6 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             break
         state = _add(state, winner, trials, rules)
     return state
-
-
-def _explains(rules: Selection, state: State) -> bool:
-    """Whether what was added explains, by the verdict's measure, all there was at first."""
-    first, now, floating = state.before, state.fitted, state.study.procedure.leaves_ground_error
-    limit = verdict_limit(rules, first.overall_chance)
-    parts = ((first.holdout, now.holdout), (first.train, now.train))
-    return bool(state.effects) and all(is_explained(rules, *part, limit, floating=floating) for part in parts)
-
-
-def _is_likely(rules: Selection, before: Fitted, winner: Trial, trials: Sequence[Trial]) -> bool:
-    """Whether the name of a trial, which goes by how much of an error is gone where it acts, is likely to be right.
-
-    Shapes of effects that are found are a little wrong, and what takes up a part of what they leave has no name.
-    """
-    known = evidence_of(rules, winner, trials)
-    left = left_where_it_acts(before, winner.fitted)
-    return certainty.STANDARD.certainty({"family": known.family, "place": known.place, "left": left}) >= rules.likely
 
 
 def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:

@@ -325,6 +325,13 @@ def is_explained(rules: Selection, first: float, last: float, limit: float, *, f
     return not last - limit > (1 - share) * (first - 1)
 
 
+def is_log_explained(rules: Selection, first: Fitted, now: Fitted, *, floating: bool) -> bool:
+    """Whether nearly all is gone, held out and fitted: what happens in one part alone must be explained there."""
+    limit = verdict_limit(rules, first.overall_chance)
+    parts = ((first.holdout, now.holdout), (first.train, now.train))
+    return all(is_explained(rules, before, after, limit, floating=floating) for before, after in parts)
+
+
 def hidden_columns(rules: Selection, now: Fitted) -> BoolArray | None:
     """Columns (n,) that are explained where fitted but not where held out; None if most of the excess is elsewhere."""
     limit = column_limit(rules, now.chance)
