@@ -65,10 +65,6 @@ class SegmentedProcedure(Procedure):
     wanders: ClassVar[bool] = True
     no_torque: ClassVar[str] = "segments are too short"
 
-    def cheap(self, numerics: Numerics) -> Numerics:
-        """The same: a step of first order leads as far away as what is looked for."""
-        return numerics
-
 
 @dataclass(frozen=True, eq=False)
 class SegmentedEpisode(Episode):
