@@ -31,7 +31,7 @@ def recorded(given: float, shown: float) -> Log:
     model = mujoco.MjModel.from_xml_string(TWO.format(dry=f'frictionloss="{FRICTION}"', upper=0.5))
     model.opt.timestep, model.opt.integrator = 0.0005, mujoco.mjtIntegrator.mjINT_RK4
     data = mujoco.MjData(model)
-    now = 0.005 * np.arange(600)
+    now = 0.005 * np.arange(600, dtype=np.float64)
     phase = rng.uniform(0, 6, size=(3, 2))
     asked = WILD / 3 * np.sin(2 * np.pi * np.array([0.4, 0.8, 1.3])[:, None] * now[:, None, None] + phase).sum(axis=1)
     position = np.empty((len(now), 2))

@@ -8,6 +8,7 @@ from math import nan
 
 from sysid_btr.diagnosis.elimination import without_dispensable
 from sysid_btr.diagnosis.evidence import evidence_of, is_likely, preference, weights
+from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
 from sysid_btr.diagnosis.selection import (
     Selection,
@@ -36,7 +37,13 @@ Say = Callable[[str], None]
 
 
 def search(state: State, library: Library, rules: Selection, progress: Progress) -> State:
-    """Add effects one at a time until nothing is left to explain, or nothing helps."""
+    """Add effects one at a time until nothing is left to explain, or nothing helps.
+
+    One whose name is not likely may become so once another is known. Where the next is not likely either, beside what
+    is, both go: they take up what forms leave that are not quite right (early stopping with patience: Prechelt 1998,
+    doi:10.1007/3-540-49430-8_3).
+    """
+    sure, doubtful = state, list[Hypothesis]()
     for number in range(1, rules.rounds + 1):
         if at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted):
             break
@@ -51,14 +58,20 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
         winner = choose(rules, now, worthy)
         floating = state.study.procedure.leaves_ground_error
         explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
+        likely = winner is not None and is_likely(rules, now, winner, trials)
         # what takes up a part of what the shapes of effects leave has no name
-        if winner is not None and explained and not is_likely(rules, now, winner, trials):
+        if explained and not likely:
             winner = None
         told = candidates_of(rules, now, trials, winner, number)
         state = replace(state, candidates=(*state.candidates, *told))
         if winner is None:
             break
         state = _add(state, winner, trials, rules)
+        doubtful = [] if likely else [*doubtful, winner.hypothesis]
+        sure = state if likely else sure
+        if sure.effects and len(doubtful) == rules.patience:
+            sure = replace(sure, candidates=state.candidates, replays=state.replays, steps=state.steps)
+            return sure.step(removed=[str(h) for h in doubtful])
     return state
 
 

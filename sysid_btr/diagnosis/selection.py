@@ -127,7 +127,11 @@ class Selection:
 
     likely: float = 0.5
     """Certainty of its name from which one more is added to effects that explain the log already (`explained`). What
-    takes up a part of what they leave is prediction and no cause; 0 adds it."""
+    takes up a part of what they leave is prediction and no cause; 0 adds it all."""
+
+    patience: int = 2
+    """Effects in turn that are added without being so likely, beside one that is, after which these go again. One may
+    wait for another that acts where it does. Judgement."""
 
     # --- which one of several ---
 
