@@ -46,7 +46,7 @@ EFFECTS = (
     "joint_spring",
 )
 """Friction, drive and mounting: what a servo on a bench can have. `--effects all` considers the whole library."""
-LADDER = Selection(minimum_gain=2e-4, likely=0.0)
+MINIMUM_GAIN = 2e-4
 """As many rungs as help to predict."""
 SEARCH, FINAL = 0.005, 0.0025
 """Steps, s, of the search and of the final fit."""
@@ -97,7 +97,7 @@ def examine(folder: Path, fold: str, effects: Sequence[str]) -> dict[str, Any]:
         sys.stderr.write(f"{perf_counter() - began:6.0f} s  {fold}: {note}\n")
 
     study = make_study(xl330(), kept, channels=("position",), numerics=Numerics("RK4", SEARCH), threads=1)
-    found = close(study, list(DECLARED), effects=effects, progress=tell, selection=LADDER)
+    found = close(study, list(DECLARED), effects=effects, progress=tell, selection=Selection(minimum_gain=MINIMUM_GAIN))
     # every log in full, and all alike
     whole = make_study(xl330(), logs, channels=("position",), numerics=Numerics("RK4", FINAL), threads=1)
     names = [Path(str(log.path)).stem for log in logs]

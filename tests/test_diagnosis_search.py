@@ -20,6 +20,7 @@ from sysid_btr.diagnosis.trials import Trial
 from sysid_btr.estimators.base import silent
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.refit import Fitted
+from sysid_btr.identify.segmented import SegmentedProcedure
 from sysid_btr.identify.study import make_study
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.effect import Effect
@@ -86,3 +87,8 @@ def test_effects_whose_names_are_not_likely_go_where_two_are_added_in_turn(
 def test_patience_says_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(found([True, False, False], monkeypatch, Selection(patience=3)).effects) == 3
     assert len(found([True, False, False], monkeypatch, Selection(patience=1)).effects) == 1
+
+
+def test_where_errors_do_not_grow_all_that_helps_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SegmentedProcedure, "wanders", False)
+    assert len(found([True, False, False], monkeypatch).effects) == 3

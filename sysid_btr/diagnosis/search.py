@@ -39,9 +39,10 @@ Say = Callable[[str], None]
 def search(state: State, library: Library, rules: Selection, progress: Progress) -> State:
     """Add effects one at a time until nothing is left to explain, or nothing helps.
 
-    One whose name is not likely may become so once another is known. Where the next is not likely either, beside what
-    is, both go: they take up what forms leave that are not quite right (early stopping with patience: Prechelt 1998,
-    doi:10.1007/3-540-49430-8_3).
+    Where errors of the model grow in a replay, what is left by a form that is not quite right grows too, and much would
+    take it up. There nothing joins effects that explain the log already unless it is likely to be what it is called.
+    Beside fewer, one that is not may become so once another is known; where the next is not likely either, both go
+    (early stopping with patience: Prechelt 1998, doi:10.1007/3-540-49430-8_3).
     """
     sure, doubtful = state, list[Hypothesis]()
     for number in range(1, rules.rounds + 1):
@@ -58,8 +59,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
         winner = choose(rules, now, worthy)
         floating = state.study.procedure.leaves_ground_error
         explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
-        likely = winner is not None and is_likely(rules, now, winner, trials)
-        # what takes up a part of what the shapes of effects leave has no name
+        likely = not state.study.procedure.wanders or (winner is not None and is_likely(rules, now, winner, trials))
         if explained and not likely:
             winner = None
         told = candidates_of(rules, now, trials, winner, number)
