@@ -1,4 +1,4 @@
-"""The forward search: how long it goes on with effects whose names are not likely."""
+"""The search: what becomes of effects whose names are not likely."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from test_segmented import double_pendulum, driven
 
+from sysid_btr.diagnosis import exchange as exchange_module
 from sysid_btr.diagnosis import search as module
 from sysid_btr.diagnosis.evidence import Evidence
+from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
@@ -21,10 +23,11 @@ from sysid_btr.estimators.base import silent
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.identify.segmented import SegmentedProcedure
-from sysid_btr.identify.study import make_study
+from sysid_btr.identify.study import Study, make_study
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, ViscousDamping
+from sysid_btr.terms.model import Model
 
 ORDER: tuple[type[Effect], ...] = (CoulombFriction, ViscousDamping, QuadraticDamping)
 
@@ -92,3 +95,26 @@ def test_patience_says_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_where_errors_do_not_grow_all_that_helps_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SegmentedProcedure, "wanders", False)
     assert len(found([True, False, False], monkeypatch).effects) == 3
+
+
+@pytest.mark.parametrize(
+    ("likely", "wanders", "taken"), [(True, True, True), (False, True, False), (False, False, True)]
+)
+def test_nothing_takes_a_place_that_is_unlikely_to_be_what_it_is_called(
+    likely: bool, wanders: bool, taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where errors grow, much takes up a part of what an effect leaves that is there."""
+    state = begun()
+    own, other = (Hypothesis(e, ("elbow",), False, np.array([0.1]), 1.0) for e in ORDER[:2])
+    now = replace(state.fitted, model=state.fitted.model.with_(own.term(state.study.scales), own.start))
+    state = replace(state, fitted=now, evidence=(Evidence(alternatives=(other,)),))
+
+    def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
+        model = rest.with_(hypothesis.term(study.scales), hypothesis.start)
+        return Trial(hypothesis, replace(now, model=model, holdout_columns=0.8 * now.holdout_columns))
+
+    monkeypatch.setattr(exchange_module, "attempt", attempt)
+    monkeypatch.setattr(exchange_module, "is_likely", lambda *_: likely)
+    monkeypatch.setattr(SegmentedProcedure, "wanders", wanders)
+    found = exchange(state, ORDER, STANDARD)
+    assert [type(e) for e in found.effects] == [ORDER[1] if taken else ORDER[0]]
