@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, NamedEffect
+from sysid_btr.diagnosis.evidence import is_likely
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity
 from sysid_btr.diagnosis.selection import (
@@ -30,6 +31,7 @@ from sysid_btr.diagnosis.selection import (
     improves_once,
     is_dispensable,
     is_explained,
+    is_log_explained,
     is_needed,
     predicts_as_well,
     something_left,
@@ -45,6 +47,7 @@ from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionLarger, StribeckFriction, ViscousDamping
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.scales import JointScale, Scales
 from sysid_btr.terms.sensing import SensorDelay
 from sysid_btr.terms.servo import CommandDelay
 
@@ -559,13 +562,15 @@ def sensitivity(
     places = (place,) if isinstance(place, str) else place
     values = np.zeros(len(effect.kinds))
     values[effect.main] = amount
-    response = np.array(direction, dtype=np.float64)[:, None]
+    response = np.sqrt(gain) * np.array(direction, dtype=np.float64)[:, None]
     perturbation = Perturbation(effect, places, ((amount,),))
-    nothing = Residual.of(np.zeros(len(response)), np.zeros((len(response), 0)))
-    return Sensitivity(perturbation, nothing, np.arange(len(response)), response, np.ones(1), gain, values)
+    # what it explains alone is all that it is asked to
+    own = Residual.of(-response[:, 0], np.zeros((len(response), 0)))
+    return Sensitivity(perturbation, own, np.arange(len(response)), response, np.ones(1), gain, values)
 
 
 HIP, KNEE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+LEG: Scales = dict.fromkeys(("hip", "knee"), JointScale(10.0, 20.0, 1.0, 2.0, 1.0, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -603,13 +608,13 @@ HIP, KNEE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     ],
 )
 def test_locations_of_a_hypothesis(found: Sequence[Sensitivity], expected: Sequence[tuple[str, ...]]) -> None:
-    assert [h.places for h in form_hypotheses(found, 3, RULES)] == list(expected)
+    assert [h.places for h in form_hypotheses(found, 3, LEG, RULES)] == list(expected)
 
 
 @pytest.mark.parametrize(("amount", "shared"), [(1.9, True), (2.1, False)])
 def test_amounts_that_nearly_agree_are_tried_as_one_too(amount: float, shared: bool) -> None:
     found = [sensitivity(SIMPLE, "hip", 1000.0, HIP), sensitivity(SIMPLE, "knee", 900.0, KNEE, amount)]
-    assert any(h.shared for h in form_hypotheses(found, 3, RULES)) is shared
+    assert any(h.shared for h in form_hypotheses(found, 3, LEG, RULES)) is shared
 
 
 @pytest.mark.parametrize(("amount", "named"), [(1.1e-3, True), (0.9e-3, False)])
@@ -618,15 +623,15 @@ def test_an_effect_that_includes_another_is_not_tried_where_it_adds_nothing(amou
     values = np.ones(len(GENERAL.kinds))
     values[GENERAL.main] = amount
     found = [replace(one, values=values), sensitivity(SIMPLE, "hip", 900.0, HIP)]
-    assert any(h.effect is GENERAL for h in form_hypotheses(found, 3, RULES)) is named
+    assert any(h.effect is GENERAL for h in form_hypotheses(found, 3, LEG, RULES)) is named
 
 
 def test_hypotheses_are_few_and_varied() -> None:
     found = [sensitivity(SIMPLE, (f"a{i}", "b"), 1000.0 - i, HIP) for i in range(5)]
     found += [sensitivity(OTHER, (f"a{i}", "b"), 500.0 - i, HIP) for i in range(5)]
-    assert [h.effect for h in form_hypotheses(found, 3, RULES)] == [SIMPLE] * 3 + [OTHER] * 3
-    assert len(form_hypotheses(found, 3, Selection(refits=2))) == 2
-    assert len(form_hypotheses(found, 3, Selection(refits_of_one=1))) == 2
+    assert [h.effect for h in form_hypotheses(found, 3, LEG, RULES)] == [SIMPLE] * 3 + [OTHER] * 3
+    assert len(form_hypotheses(found, 3, LEG, Selection(refits=2))) == 2
+    assert len(form_hypotheses(found, 3, LEG, Selection(refits_of_one=1))) == 2
 
 
 # --- verdict --------------------------------------------------------------------------------------------------
@@ -635,6 +640,24 @@ def test_hypotheses_are_few_and_varied() -> None:
 def test_the_limit_of_a_verdict_grows_with_chance() -> None:
     assert verdict_limit(RULES, 0.0) == pytest.approx(1.1)
     assert verdict_limit(RULES, 0.1) == pytest.approx(1.4)
+
+
+@pytest.mark.parametrize(
+    ("holdout", "train", "expected"), [(3.4, 3.4, True), (3.7, 3.4, False), (3.4, 3.7, False), (1.0, 1.0, True)]
+)
+def test_a_log_is_explained_where_it_is_fitted_and_where_it_is_not(
+    holdout: float, train: float, expected: bool
+) -> None:
+    now = fitted([holdout], [train])
+    assert is_log_explained(RULES, fitted([101.0]), now, floating=False) is expected
+
+
+@pytest.mark.parametrize(("left", "expected"), [(0.1, True), (0.3, True), (0.4, False), (0.7, False)])
+def test_a_name_is_likely_where_hardly_anything_is_left(left: float, expected: bool) -> None:
+    """At the least certainty with all the weight that a family can have: 0.34 of the excess is left."""
+    winner = trial(SIMPLE, fitted([1 + 99 * left]))
+    assert is_likely(RULES, fitted([100.0]), winner, [winner]) is expected
+    assert is_likely(Selection(likely=0.0), fitted([100.0]), winner, [winner])
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from sysid_btr.diagnosis.state import State
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.fit import Fit, fit
-from sysid_btr.identify.horizon import is_held
+from sysid_btr.identify.horizon import CURVED, is_held
 from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.segmented import SegmentedEpisode, follow, measured_motion
@@ -172,6 +172,32 @@ def test_columns_count_in_a_scan_by_what_is_left_in_them_on_its_short_segments()
     found, _ = leading_hypotheses(state, (CoulombFriction, TorqueScale), STANDARD)
     gain = {effect: max(h.gain for h in found if h.effect is effect) for effect in (CoulombFriction, TorqueScale)}
     assert gain[CoulombFriction] > STANDARD.hopeless * gain[TorqueScale]
+
+
+def test_what_is_missing_is_looked_for_before_masses_make_up_for_it() -> None:
+    """Masses that are fitted without friction lie at their bounds, and amounts that are found there are far off."""
+    study = make_study(double_pendulum(), [driven()], numerics=Numerics("RK4", 0.005), threads=1)
+    state = State.of(fit(study, ["mass:*"]), None)
+    assert state.fitted.model.values.max() > 2.0
+    found, _ = leading_hypotheses(state, (CoulombFriction,), STANDARD)
+    start = next(h.start for h in found if set(h.places) == set(JOINTS))
+    assert start == pytest.approx(np.full_like(start, FRICTION), rel=0.35)
+
+
+@pytest.mark.parametrize("torque", [QUIET, WILD])
+def test_a_model_that_lacks_something_is_followed_until_its_error_is_half_of_the_motion(torque: float) -> None:
+    log = driven(torque=torque)
+    lacking, right = (follow(double_pendulum(dry), log).seconds for dry in ("", f'frictionloss="{FRICTION}"'))
+    assert lacking <= right
+    study = make_study(double_pendulum(), [log], numerics=Numerics("RK4", 0.005), threads=1)
+    error = score(study, Model.of(())).train["position"].rmse
+    assert error < CURVED * float(np.hypot(*(log.channels[f"position.{j}"].std() for j in JOINTS)))
+
+
+def test_friction_shortens_segments_of_a_quiet_log() -> None:
+    log = driven(torque=QUIET)
+    lacking, right = (follow(double_pendulum(dry), log).seconds for dry in ("", f'frictionloss="{FRICTION}"'))
+    assert lacking < 0.7 * right
 
 
 def test_errors_over_the_whole_log_are_told_where_they_stay_bounded() -> None:

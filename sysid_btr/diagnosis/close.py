@@ -25,11 +25,15 @@ from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import Study
 from sysid_btr.io._text import some
 from sysid_btr.io.noise import is_white
+from sysid_btr.models.commands import drives_nothing
 from sysid_btr.progress import phase, shows_progress, watched
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.effect import COMMANDS, GROUND, Effect
+from sysid_btr.terms.effect import COMMANDS, GROUND, Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.library import select_effects
+
+OF_DRIVES = ("delay", "gain", "saturation", "servo law", "supply")
+"""Families of what a drive makes of its command: none where the torque that it gave moves the model."""
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -121,8 +125,11 @@ def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[
     """Effects that these logs could show at all, given mount and channels."""
     floating = any(episode.procedure.leaves_ground_error for episode in study.train)
     replayed = any(episode.procedure.replayed for episode in study.train)
+    given = all(drives_nothing(episode.log, study.robot.for_log(episode.log).model) for episode in study.train)
     result = []
     for effect in filter(study.shows, effects):
+        if given and effect.scope != "joint" and family_of(effect) in OF_DRIVES:
+            continue
         if (effect.needs == GROUND and not floating) or (effect.needs == COMMANDS and not replayed):
             continue
         if effect.needs == "effort" and not any(episode.logged(("effort",)) for episode in study.train):

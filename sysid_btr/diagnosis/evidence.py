@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.certainty import STANDARD
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.trials import Trial, is_rival
@@ -72,6 +73,13 @@ def evidence_of(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Evi
     alternatives = tuple(best[name][1] for name in told)
     rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
     return Evidence(rivals, float(family), float(place), told, alternatives)
+
+
+def is_likely(rules: Selection, before: Fitted, winner: Trial, trials: Sequence[Trial]) -> bool:
+    """Whether the name of one of `trials`, beside the model `before` it, is more likely right than `rules` ask for."""
+    known = evidence_of(rules, winner, trials)
+    left = left_where_it_acts(before, winner.fitted)
+    return STANDARD.certainty({"family": known.family, "place": known.place, "left": left}) >= rules.likely
 
 
 def preference(before: Fitted, after: Fitted) -> float:

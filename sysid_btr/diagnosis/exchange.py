@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import IntArray
-from sysid_btr.diagnosis.evidence import evidence_of
+from sysid_btr.diagnosis.evidence import evidence_of, is_likely
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, replacements
 from sysid_btr.diagnosis.selection import Selection
@@ -102,6 +102,9 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     trials += [attempt(state.study, rest, hypothesis, rules) for hypothesis in hypotheses]
     state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
     winner = preferred(rules, trials)
+    if winner is not trials[0] and state.study.procedure.wanders and not is_likely(rules, state.fitted, winner, trials):
+        # what is left grows in such a replay, and much would take it up: see `search`
+        winner = trials[0]
     known = evidence_of(rules, winner, trials)
     if winner is trials[0]:
         if not part.whole:

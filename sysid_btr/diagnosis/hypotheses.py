@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.scan import Sensitivity
+from sysid_btr.diagnosis.scan import Sensitivity, best_multiples
 from sysid_btr.diagnosis.selection import Selection, agree
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.scales import Scales
+from sysid_btr.terms.scales import Scales, scale_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +56,14 @@ class Hypothesis:
         return f"{self.effect.label or self.effect.name} at {places}"
 
 
-def form_hypotheses(found: Sequence[Sensitivity], residuals: int, rules: Selection) -> list[Hypothesis]:
+def form_hypotheses(found: Sequence[Sensitivity], residuals: int, scales: Scales, rules: Selection) -> list[Hypothesis]:
     """The most promising hypotheses of a scan, best first, of different effects as far as possible.
 
     Parameters
     ----------
     found : by a scan.
     residuals : length of the residual vector.
+    scales : sizes at the joints.
     rules : what a hypothesis needs, and how many to return.
     """
     best_at: dict[str, float] = {}
@@ -82,14 +83,12 @@ def form_hypotheses(found: Sequence[Sensitivity], residuals: int, rules: Selecti
         lead = own[0]
         result.append(Hypothesis(effect, (lead.perturbation.place,), False, lead.values, lead.gain))
         candidates = [s for s in own if s.gain >= rules.location_rival * best_at[s.perturbation.place]]
-        group, gain = _grow(lead, candidates, residuals, rules)
-        group = group[: max(rules.most_parameters // len(effect.kinds), 1)]
-        if len(group) > 1:
-            places = tuple(s.perturbation.place for s in group)
-            values = np.array([s.values for s in group])
-            result.append(Hypothesis(effect, places, False, values.ravel(), gain))
+        group = _grow(lead, candidates, residuals, rules)
+        if len(group.members) > 1:
+            values = group.values(scales)
+            result.append(Hypothesis(effect, group.places, False, values.ravel(), group.gain))
             if agree(values[:, effect.main], rules.common_spread):
-                result.append(Hypothesis(effect, places, True, np.median(values, axis=0), gain))
+                result.append(Hypothesis(effect, group.places, True, np.median(values, axis=0), group.gain))
     result.sort(key=lambda h: -h.gain)
     return _varied(_without_idle(result, rules), rules)
 
@@ -139,41 +138,60 @@ def _best_probe_per_place(found: Sequence[Sensitivity]) -> list[Sensitivity]:
     return sorted(best.values(), key=lambda s: -s.gain)
 
 
-def _grow(
-    lead: Sensitivity, candidates: Sequence[Sensitivity], residuals: int, rules: Selection
-) -> tuple[list[Sensitivity], float]:
-    """Add locations greedily while they explain something that those before do not (orthogonal matching)."""
-    group = [lead]
-    basis = _unit(lead, residuals, None)
-    target_gain = lead.gain
-    for one in candidates:
-        if one is lead:
-            continue
-        vector = _unit(one, residuals, basis)
-        if vector is None or basis is None:
-            continue
-        # gain that is left after what the group explains, to first order
-        kept = float(np.linalg.norm(vector[:, -1])) if vector.size else 0.0
-        share = kept**2 if kept < 1 else 1.0
-        left = one.gain * share
-        if left >= max(rules.candidate_gain, rules.location_gain * target_gain):
-            group.append(one)
-            target_gain += left
-            basis = np.column_stack([basis, vector[:, -1] / max(kept, 1e-300)])
-    return group, target_gain
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """One effect at several locations, with amounts that explain most together.
+
+    Attributes
+    ----------
+    members : what was scanned at each.
+    multiples : (k,) of what each explains alone.
+    gain : decrease of the sum of squared residuals.
+    """
+
+    members: tuple[Sensitivity, ...]
+    multiples: FloatArray
+    gain: float
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        return tuple(s.perturbation.place for s in self.members)
+
+    def values(self, scales: Scales) -> FloatArray:
+        """(k, kinds) numbers of the effect at each; those that it has alone where others are not legal."""
+        rows = []
+        for one, multiple in zip(self.members, self.multiples, strict=True):
+            effect, scale = one.perturbation.effect, scale_at(scales, one.perturbation.place)
+            values = effect.combine(scale, one.perturbation.probe, multiple * one.amounts)
+            rows.append(one.values if values is None else values)
+        return np.array(rows)
 
 
-def _unit(one: Sensitivity, residuals: int, basis: FloatArray | None) -> FloatArray | None:
-    """What it explains of the residual as a unit vector, less what a basis spans; (residuals, 1)."""
-    full = np.zeros(residuals)
-    full[one.rows] = one.explained
-    norm = float(np.linalg.norm(full))
-    if norm == 0:
-        return None
-    full /= norm
-    if basis is not None:
-        full = full - basis @ (basis.T @ full)
-    return full[:, None]
+def _grow(lead: Sensitivity, candidates: Sequence[Sensitivity], residuals: int, rules: Selection) -> _Group:
+    """Add locations greedily while they explain something that those before do not.
+
+    The amounts of all are found anew with each (orthogonal matching pursuit: Pati, Rezaiifar and Krishnaprasad 1993,
+    doi:10.1109/ACSSC.1993.342465): joints of one limb share what each would explain alone.
+    """
+    offered = [lead, *(one for one in candidates if one is not lead)]
+    explained = np.zeros((residuals, len(offered)))
+    for k, one in enumerate(offered):
+        explained[one.rows, k] = one.explained
+    # the residual is measured minus predicted, so what explains it has the opposite sign
+    gram, target = explained.T @ explained, np.array([-one.explained @ one.residual.rest[one.rows] for one in offered])
+    effect = lead.perturbation.effect
+    most = max(rules.most_parameters // len(effect.kinds), 1)
+    kept, group = [0], _Group((lead,), np.ones(1), lead.gain)
+    for k in range(1, len(offered)):
+        if len(kept) == most:
+            break
+        trial = [*kept, k]
+        part, aim = gram[np.ix_(trial, trial)], target[trial]
+        multiples = best_multiples(part, aim, signed=effect.signed)
+        gain = float(2 * multiples @ aim - multiples @ part @ multiples)
+        if gain - group.gain >= max(rules.candidate_gain, rules.location_gain * group.gain):
+            kept, group = trial, _Group(tuple(offered[i] for i in trial), multiples, gain)
+    return group
 
 
 def _without_idle(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
@@ -189,10 +207,15 @@ def _idle(h: Hypothesis, rules: Selection) -> bool:
 
 
 def _varied(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
-    """Best first, but only some hypotheses of one effect class, so that rivals get their turn."""
+    """Best first, each once, but only some of one effect class, so that rivals get their turn."""
     taken: dict[type[Effect], int] = {}
+    known = set()
     result = []
     for hypothesis in ranked:
+        same = (hypothesis.effect, frozenset(hypothesis.places), hypothesis.shared)
+        if same in known:
+            continue
+        known.add(same)
         if taken.get(hypothesis.effect, 0) < rules.refits_of_one:
             taken[hypothesis.effect] = taken.get(hypothesis.effect, 0) + 1
             result.append(hypothesis)

@@ -40,7 +40,7 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
         return from_arrays(known.arrays, library, places), int(known.arrays["answers"])
     began = perf_counter()
     found, residuals = _scan(state, [e for e in library if e not in FREE_FORMS], rules)
-    hypotheses = form_hypotheses(found, residuals, rules)
+    hypotheses = form_hypotheses(found, residuals, state.study.scales, rules)
     hypotheses += _curves(state, library, rules)
     if study.journal is not None:
         arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
@@ -80,22 +80,21 @@ def replacements(state: State, library: Library, parts: Sequence[IntArray], rule
     result = []
     for own, rest in zip(found, without, strict=True):
         least = rules.replaces * float(rest.rest @ rest.rest - whole.rest @ whole.rest)
-        result.append([h for h in form_hypotheses(own, len(residual), rules) if h.gain >= least])
+        result.append([h for h in form_hypotheses(own, len(residual), study.scales, rules) if h.gain >= least])
     return result
 
 
 def _linear(study: Study, model: Model, rules: Selection) -> tuple[ReplayProblem, FloatArray, FloatArray]:
     """What is scanned: the problem, and its residual (r,) and Jacobian (r, p) under the model so far."""
-    if study.procedure.shares:
-        # what is missing acts in proportion on short segments alone
-        study = _weighed(study.with_share(study.procedure.shares[0], model), model)
+    if study.procedure.wanders:
+        study = _weighed(study, model)
     problem = shorten(study, rules.scan_seconds).train_problem(model)
     return problem, *linearise(problem, model.values, step=study.stencil(model.terms))
 
 
 def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensitivity], int]:
     """What every effect would do to the residual, best first, and the number of residuals."""
-    study, model = state.study, state.fitted.model
+    study, model = state.study, _scanned(state)
     problem, residual, jacobian = _linear(study, model, rules)
     asked = _perturbations(state, library, problem, residual)
     if study.procedure.costly and len(asked) > rules.glance_most:
@@ -107,6 +106,16 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     cheap = problem.with_numerics(study.cheap)
     found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
     return found, len(residual)
+
+
+def _scanned(state: State) -> Model:
+    """The model in which effects are simulated: as fitted, or, while all is missing, before it was fitted far off.
+
+    What declared parameters can do is taken off to first order, wherever they are.
+    """
+    model = state.fitted.model
+    off = state.study.procedure.wanders and not state.effects
+    return model.at(model.terms.nominal) if off else model
 
 
 def _weighed(study: Study, model: Model) -> Study:

@@ -326,17 +326,20 @@ def _judge(
 
 
 def _legal(effect: type[Effect], gram: FloatArray, target: FloatArray) -> FloatArray:
-    """Minimise a'Ga - 2 a't under the effect's signs; working points of thresholds are not stretched far."""
-    if effect.signed:
+    """Amounts under the effect's signs that explain most; working points of thresholds are not stretched far."""
+    amounts = best_multiples(gram, target, signed=effect.signed)
+    if not effect.signed and effect.held and len(effect.held) == len(effect.kinds):
+        amounts = np.minimum(amounts, 1.5)
+    return amounts
+
+
+def best_multiples(gram: FloatArray, target: FloatArray, *, signed: bool) -> FloatArray:
+    """Minimise a'Ga - 2 a't, over a that is not negative unless it has a sign of its own."""
+    if signed:
         # directions that hardly any sensor sees stay at zero
         return np.asarray(np.linalg.pinv(gram, rcond=FAINT, hermitian=True) @ target)
     from scipy.optimize import nnls
 
     values, vectors = np.linalg.eigh(gram)
     root = np.sqrt(np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
-    a = root[:, None] * vectors.T
-    b = (vectors.T @ target) / root
-    amounts = np.asarray(nnls(a, b)[0])
-    if effect.held and len(effect.held) == len(effect.kinds):
-        amounts = np.minimum(amounts, 1.5)
-    return amounts
+    return np.asarray(nnls(root[:, None] * vectors.T, (vectors.T @ target) / root)[0])

@@ -7,9 +7,17 @@ from dataclasses import replace
 from math import nan
 
 from sysid_btr.diagnosis.elimination import without_dispensable
-from sysid_btr.diagnosis.evidence import evidence_of, preference, weights
+from sysid_btr.diagnosis.evidence import evidence_of, is_likely, preference, weights
+from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
-from sysid_btr.diagnosis.selection import Selection, all_explained, at_floor, has_minimum_gain, improves
+from sysid_btr.diagnosis.selection import (
+    Selection,
+    all_explained,
+    at_floor,
+    has_minimum_gain,
+    improves,
+    is_log_explained,
+)
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import (
     Trial,
@@ -32,7 +40,14 @@ ROUND_SHARE = 0.35
 
 
 def search(state: State, library: Library, rules: Selection, progress: Progress) -> State:
-    """Add effects one at a time until nothing is left to explain, or nothing helps."""
+    """Add effects one at a time until nothing is left to explain, or nothing helps.
+
+    Where errors of the model grow in a replay, what is left by a form that is not quite right grows too, and much would
+    take it up. There nothing joins effects that explain the log already unless it is likely to be what it is called.
+    Beside fewer, one that is not may become so once another is known; where the next is not likely either, both go
+    (early stopping with patience: Prechelt 1998, doi:10.1007/3-540-49430-8_3).
+    """
+    sure, doubtful = state, list[Hypothesis]()
     for number in range(1, rules.rounds + 1):
         if at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted):
             break
@@ -46,11 +61,21 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             state, trials = _try_promising(state, library, rules, say)
         worthy = [t for t in trials if _is_worthy(rules, state, t)]
         winner = choose(rules, now, worthy)
+        floating = state.study.procedure.leaves_ground_error
+        explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
+        likely = not state.study.procedure.wanders or (winner is not None and is_likely(rules, now, winner, trials))
+        if explained and not likely:
+            winner = None
         told = candidates_of(rules, now, trials, winner, number)
         state = replace(state, candidates=(*state.candidates, *told))
         if winner is None:
             break
         state = _add(state, winner, trials, rules)
+        doubtful = [] if likely else [*doubtful, winner.hypothesis]
+        sure = state if likely else sure
+        if sure.effects and len(doubtful) == rules.patience:
+            sure = replace(sure, candidates=state.candidates, replays=state.replays, steps=state.steps)
+            return sure.step(removed=[str(h) for h in doubtful])
     return state
 
 

@@ -125,6 +125,13 @@ class Selection:
     """Weight of the model with an effect against that without it on held-out data (`evidence.preference`), from which
     it is added: it must be the more likely of the two."""
 
+    likely: float = 0.5
+    """Certainty of its name from which one more is added to effects that explain the log already (`explained`), where
+    errors grow in a replay: it must be more likely right than not."""
+    patience: int = 2
+    """Effects in turn that are added without being so likely, beside one that is, after which these go again. One may
+    wait for another that acts where it does. Judgement."""
+
     # --- which one of several ---
 
     simpler: float = 0.06
@@ -328,6 +335,13 @@ def is_explained(rules: Selection, first: float, last: float, limit: float, *, f
     """Whether a chi2 is at its limit, or near it and nearly all of its first excess is gone."""
     share = rules.explained_floating if floating else rules.explained
     return last <= limit or (last <= rules.explained_most and last - limit <= (1 - share) * (first - 1))
+
+
+def is_log_explained(rules: Selection, first: Fitted, now: Fitted, *, floating: bool) -> bool:
+    """Whether nearly all is gone, held out and fitted: what happens in one part alone must be explained there."""
+    limit = verdict_limit(rules, first.overall_chance)
+    parts = ((first.holdout, now.holdout), (first.train, now.train))
+    return all(is_explained(rules, before, after, limit, floating=floating) for before, after in parts)
 
 
 def hidden_columns(rules: Selection, now: Fitted) -> BoolArray | None:

@@ -8,7 +8,7 @@ from sysid_btr.diagnosis import certainty
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, Verdict
 from sysid_btr.diagnosis.evidence import Evidence, left_where_it_acts, share_explained
 from sysid_btr.diagnosis.messages import message_of, sentence_of
-from sysid_btr.diagnosis.selection import Selection, is_explained, something_left, verdict_limit
+from sysid_btr.diagnosis.selection import Selection, is_log_explained, something_left, verdict_limit
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
 from sysid_btr.identify.intervals import Estimate
@@ -29,9 +29,7 @@ def verdict_of(
     limit = verdict_limit(rules, before.overall_chance)
     if not named:
         return "nothing_missing" if max(now.holdout, now.train) <= limit else "unexplained"
-    # what happens in the fitted part alone must be explained there
-    parts = ((before.holdout, now.holdout), (before.train, now.train))
-    if all(is_explained(rules, first, last, limit, floating=floating) for first, last in parts):
+    if is_log_explained(rules, before, now, floating=floating):
         return "ambiguous" if any(e.confused_with for e in named) else "explained"
     # what predicts data that were not fitted worse than the model without it is no explanation
     return "partly_explained" if any(e.likely for e in named) and now.holdout < before.holdout else "unexplained"

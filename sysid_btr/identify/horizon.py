@@ -1,9 +1,12 @@
-"""How long a replay can be followed: as long as small changes of its start and of the masses act in proportion.
+"""How long a replay can be followed: as long as changes of its start, of the masses, and its error act in proportion.
 
 What is known of a start is integrated out along derivatives, and a fit steps along them: both need responses whose
 curved part is small beside the linear one (Bates and Watts 1980, doi:10.1111/j.2517-6161.1980.tb01094.x). Where errors
 grow exponentially that ends after some Lyapunov times, and beyond it the objective is rough (Ribeiro et al. 2020,
-doi:10.1016/j.automatica.2020.109158); where a servo or friction takes them back it never does.
+doi:10.1016/j.automatica.2020.109158); where a servo or friction takes them back it never does. What a model lacks is a
+change too, as large as the error that it makes: the curved part of an oscillation's response is to its linear one as
+the response is to the oscillation, so an error that is a good part of the motion is no longer in proportion to its
+cause.
 """
 
 from __future__ import annotations
@@ -33,8 +36,10 @@ def is_held(robot: Robot, log: Log) -> bool:
     return all(joint in servos for joint in joint_names(configured) if log.has("position", joint))
 
 
-def linear_seconds(robot: Robot, log: Log, segments: Segments, threads: int = 0) -> tuple[FloatArray, FloatArray]:
-    """How long the replay of each segment by the plain model stays linear, and how far it is then off.
+def linear_seconds(
+    robot: Robot, log: Log, segments: Segments, threads: int = 0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How long the replay of each segment by the plain model stays linear, and near the log, and how far it is off.
 
     Changes are one standard deviation of each number of the start, and one `scale` of each body's mass.
 
@@ -46,9 +51,10 @@ def linear_seconds(robot: Robot, log: Log, segments: Segments, threads: int = 0)
 
     Returns
     -------
-    seconds, misfit : (w,) each; seconds are all of a segment where it is linear to the end. The misfit is the
-        root-mean-square error up to there over the standard deviation of what was measured: 1 is no better than to
-        stand still.
+    linear, near, misfit : (w,) each, s: until changes of start and masses, and until the error of the model itself, do
+        not act in proportion any more; all of a segment where they do to the end. The misfit is the root-mean-square
+        error as long as it is linear, over the standard deviation of what was measured: 1 is no better than to stand
+        still.
     """
     terms = Terms(parse_parameters(["mass:*"], robot))
     whole = SegmentReplay(robot.for_log(log), log, tuple(terms), largest_step(log), threads=threads, segments=segments)
@@ -59,7 +65,7 @@ def linear_seconds(robot: Robot, log: Log, segments: Segments, threads: int = 0)
     nominal, step = terms.nominal, np.diag(terms.scale)
     candidates = np.concatenate([nominal[None], nominal + step, nominal - step])
     identity = np.eye(segments.std.shape[1])
-    seconds, misfit = np.zeros(len(segments)), np.zeros(len(segments))
+    linear, near, misfit = np.zeros((3, len(segments)))
     for w, (a, b) in enumerate(segments.rows):
         replay = replace(whole, segments=segments.chosen(np.array([w])))
         directions = segments.std[w] * np.concatenate([0 * identity[:1], identity, -identity])
@@ -68,11 +74,13 @@ def linear_seconds(robot: Robot, log: Log, segments: Segments, threads: int = 0)
             by_start = next(outputs.position for _, outputs in replay.respond(nominal, directions))
         time = log.time[a:b] - log.time[a]
         end = min(_linear(x[:, :, joints] / sigma) for x in (by_mass, by_start))
-        error = (measured[a:b] - by_mass[0][:, joints])[:end]
+        error = measured[a:b] - by_mass[0][:, joints]
+        near[w] = time[_small(error / sigma, measured[a:b] / sigma) - 1]
+        error = error[:end]
         moved = measured[a:b][:end] - np.nanmean(measured[a:b][:end], axis=0)
-        seconds[w] = time[end - 1]
+        linear[w] = time[end - 1]
         misfit[w] = np.sqrt(np.nansum(error**2) / max(float(np.nansum(moved**2)), 1e-300))
-    return seconds, misfit
+    return linear, near, misfit
 
 
 def _linear(white: FloatArray) -> int:
@@ -92,3 +100,12 @@ def _linear(white: FloatArray) -> int:
     fine = (curved <= CURVED * linear) | (curved <= 1.0)
     bad = np.flatnonzero(~fine.all(axis=0))
     return max(int(bad[0]), 1) if len(bad) else int(count[-1])
+
+
+def _small(error: FloatArray, measured: FloatArray) -> int:
+    """Samples, at least one, up to which an error (n, j) is small beside the motion; both in noise floors."""
+    count = np.arange(1, len(error) + 1)
+    size = np.sqrt(np.cumsum(np.nansum(error**2, axis=1)) / count)
+    motion = np.sqrt(np.nansum(np.nanvar(measured, axis=0)))
+    large = np.flatnonzero(~(size <= max(CURVED * float(motion), 1.0)))
+    return max(int(large[0]), 1) if len(large) else len(error)

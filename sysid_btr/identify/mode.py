@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 
 from sysid_btr.errors import UsageError
+from sysid_btr.identify.driving import measured_torques
 from sysid_btr.identify.episode import Episode
 from sysid_btr.identify.horizon import is_held
 from sysid_btr.identify.segmented import follow
 from sysid_btr.io.log import COMMANDS, Log
 from sysid_btr.models.robot import Robot, joint_names
 
+GIVEN = "driven by the measured torques, with which the plain model moves more like the log than with those commanded"
 AUTO, WHOLE = "auto", "whole"
 KINDS = {
     "forward": "sysid_btr.identify.episode:FixedEpisode",
@@ -85,7 +87,7 @@ def episode_of(robot: Robot, log: Log, mode: Mode, threads: int = 0) -> Episode:
     UsageError
         If the log does not suit the mode.
     """
-    name, why = _resolve(robot, log, mode, threads)
+    name, why, log = _resolved(robot, log, mode, threads)
     whole: Episode = _kind(name).whole(robot, log, threads, **_length(name, mode))
     return replace(whole, why=why)
 
@@ -100,7 +102,7 @@ def split_episode(robot: Robot, log: Log, holdout: float, mode: Mode, threads: i
     LogError
         If a part would be too short, or the base cannot be reconstructed.
     """
-    name, why = _resolve(robot, log, mode, threads)
+    name, why, log = _resolved(robot, log, mode, threads)
     fitted, held = _kind(name).split(robot, log, holdout, threads, **_length(name, mode))
     return replace(fitted, why=why), replace(held, why=why)
 
@@ -108,6 +110,15 @@ def split_episode(robot: Robot, log: Log, holdout: float, mode: Mode, threads: i
 def _length(name: str, mode: Mode) -> dict[str, float]:
     """The length of segments that is asked for, where it is."""
     return {"seconds": mode.seconds} if name == "segments" and mode.seconds > 0 else {}
+
+
+def _resolved(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str, Log]:
+    """The mode of one log, why, and the log with what moves its drives."""
+    name, why = _resolve(robot, log, mode, threads)
+    given = measured_torques(robot, log, threads) if name in ("forward", "segments") else None
+    if given is None:
+        return name, why, log
+    return name, "; ".join(filter(None, (why, GIVEN))), given
 
 
 def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str]:

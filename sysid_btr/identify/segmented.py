@@ -65,10 +65,6 @@ class SegmentedProcedure(Procedure):
     wanders: ClassVar[bool] = True
     no_torque: ClassVar[str] = "segments are too short"
 
-    def cheap(self, numerics: Numerics) -> Numerics:
-        """The same: a step of first order leads as far away as what is looked for."""
-        return numerics
-
 
 @dataclass(frozen=True, eq=False)
 class SegmentedEpisode(Episode):
@@ -174,6 +170,8 @@ class SegmentedEpisode(Episode):
         """As for a whole replay, judged over segments as short as those of first fits, their starts integrated out.
 
         What a step does wrong grows along long ones as every other error does, which a fit answers for (`step_check`).
+        It is small beside what the plain model leaves, or beside the noise where that leaves none: half a step also
+        moves the borders between which a command is held, which no step is fine enough for where a clock jitters.
         A start between two borders of steps is taken back to the first one, which is an error of the start.
         """
         if self.log.meta.servo_period:
@@ -189,8 +187,12 @@ class SegmentedEpisode(Episode):
             target = compared.targets[0]
             with silenced():
                 found = compared.errors(compared.replay.predict(plain))[0]
-            return {j: found[target.mask[:, k], k] for k, j in enumerate(target.joints)}
+            white = {j: found[target.mask[:, k], k] / target.noise[k] for k, j in enumerate(target.joints)}
+            # the size of what is left, once and for all steps
+            left.update({j: max(float(np.sqrt(np.mean(x**2))), 1.0) for j, x in white.items() if j not in left})
+            return {j: target.noise[k] * white[j] / left[j] for k, j in enumerate(target.joints)}
 
+        left: dict[str, float] = {}
         chosen, error = converged(first, errors, self.log)
         if not np.isfinite(error):
             raise ModelError(
@@ -221,7 +223,7 @@ class Followed:
 
     Attributes
     ----------
-    seconds : for how long half of the replays from different samples are linear.
+    seconds : for how long half of the replays from different samples are well within what is linear, and near the log.
     open_loop : whether the replay of all of it is linear to its end, and no worse than to stand still.
     """
 
@@ -237,12 +239,13 @@ def follow(robot: Robot, log: Log, threads: int = 0) -> Followed:
 def _follow(robot: Robot, log: Log, threads: int) -> Followed:
     tracks, n = measured_motion(robot, log), len(log)
     first = np.linspace(0, LATEST * n, STARTS).astype(np.int64)
-    seconds, misfit = linear_seconds(
+    linear, near, misfit = linear_seconds(
         robot, log, _starts_at(tracks, np.stack([first, np.full(STARTS, n)], axis=1)), threads
     )
-    whole = seconds[0] >= log.time[-1] - log.time[0]
+    whole = linear[0] >= log.time[-1] - log.time[0]
+    seconds = float(np.median(np.minimum(KEPT * linear, near)))
     least = FEWEST * float(np.median(np.diff(log.time)))
-    return Followed(max(float(np.median(seconds)), least), bool(whole and misfit[0] <= 1.0))
+    return Followed(max(seconds, least), bool(whole and misfit[0] <= 1.0))
 
 
 def measured_motion(robot: Robot, log: Log) -> Tracks:

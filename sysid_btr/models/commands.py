@@ -48,6 +48,21 @@ def driven_by_effort(log: Log, model: mujoco.MjModel) -> frozenset[str]:
     return frozenset(d.joint for d in joint_drives(model) if _command(log, d)[1] == f"{MEASURED}.{d.joint}")
 
 
+def as_measured(log: Log, model: mujoco.MjModel) -> Log:
+    """The log without commands of torque drives whose torque was measured, which then stands in for them."""
+    dropped: set[str] = set()
+    for drive in joint_drives(model):
+        if drive.kind == "torque" and log.meta.drive != "none" and log.has(MEASURED, drive.joint):
+            dropped |= {*command_columns(log, drive), f"{OWN_CHANNEL['torque']}.{drive.joint}"}
+    return replace(log, channels={name: values for name, values in log.channels.items() if name not in dropped})
+
+
+def drives_nothing(log: Log, model: mujoco.MjModel) -> bool:
+    """Whether the torque of every drive was measured and is given, so that no drive makes it of a command."""
+    drives = joint_drives(model)
+    return bool(drives) and not own_controls(model) and driven_by_effort(log, model) >= {d.joint for d in drives}
+
+
 def command_columns(log: Log, drive: Drive) -> Iterator[str]:
     """Columns that command a drive: by its joint, by itself; more than one is one too many."""
     yield from (f"command.{name}" for name in dict.fromkeys((drive.joint, drive.name)) if log.has("command", name))
