@@ -56,6 +56,7 @@ format: $(VENV)/installed-dev
 
 clean:
 	rm -rf $(VENV) demo_out docs/html dist executed .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find $(SOURCES) -name '*.nb[ci]' -delete
 
 $(VENV)/bin/python:
 	python=$$($(FIND_PYTHON)) && $$python -m venv $(VENV)

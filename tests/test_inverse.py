@@ -201,7 +201,7 @@ def test_a_form_that_no_law_has_is_learnt_and_named_by_its_family(arm: Robot) ->
     assert (spring.effect, spring.family, spring.where) == ("free_torque", "spring", ("elbow",))
     assert spring.likely
     assert min(spring.explains.values()) > 0.9
-    assert "torque that depends on the position: elbow" in found.message
+    assert "torque that depends on the position at elbow" in found.message
 
 
 def test_what_a_mode_cannot_do_is_said(arm: Robot) -> None:

@@ -15,8 +15,8 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import UsageError
 from sysid_btr.simulation.laws import address_of
 from sysid_btr.simulation.mujoco_batch import MujocoBatch
-from sysid_btr.simulation.mujoco_steps import Kept, roll, threads_of
-from sysid_btr.simulation.stepping import plan_of, written
+from sysid_btr.simulation.mujoco_steps import threads_of
+from sysid_btr.simulation.stepping import Kept, plan_of, roll, written
 from sysid_btr.terms.base import Kind, Term
 from sysid_btr.terms.free_form import FREE_FORMS, SPLINES, smooth_modes, spline
 from sysid_btr.terms.law import Step

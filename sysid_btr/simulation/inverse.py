@@ -156,7 +156,8 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> Actin
     if not laws:
         return lambda candidate, torque, load: (np.zeros(torque.shape), np.zeros(torque.shape))
     # imports what compiles laws, which takes a second
-    from sysid_btr.simulation.laws import on_samples, table_of
+    from sysid_btr.simulation.laws import table_of
+    from sysid_btr.simulation.stepping import on_samples
 
     table, numbers = table_of(laws, candidates)
     position, velocity = (np.ascontiguousarray(x) for x in (motion.position, motion.velocity))

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba import types
 from numba.core.errors import NumbaError
-from numba.extending import intrinsic, register_jitable
+from numba.extending import register_jitable
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import UsageError
@@ -71,6 +70,14 @@ def _ends(counts: Any) -> IntArray:
     return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(_whole(counts))])
 
 
+def compiled(function: Callable[..., Any]) -> Any:
+    """A function as machine code, which is kept beside its source where there is a place for it."""
+    found = numba.njit(nogil=True, error_model="numpy")(function)
+    with suppress(RuntimeError):  # neither a file nor a cache that can be written: compiled again in each process
+        found.enable_caching()
+    return found
+
+
 @cache
 def address_of(law: Callable[..., None]) -> int:
     """Where the machine code of a law is.
@@ -81,17 +88,15 @@ def address_of(law: Callable[..., None]) -> int:
         The law is not in the Python that numba compiles.
     """
     _register_used(law)
-    compiled = numba.njit(nogil=True, error_model="numpy")(law)
+    own = compiled(law)
     try:
-        with suppress(RuntimeError):  # one without a file is compiled again in each process
-            compiled.enable_caching()
-        compiled.compile(SIGNATURE)
+        own.compile(SIGNATURE)
     except NumbaError as error:
         raise UsageError(
             f"{law.__module__}.{law.__qualname__} cannot be compiled: {str(error).strip()}\n"
             "A law acts on the numbers of one candidate, in the Python that numba compiles: numbers, arrays, math"
         ) from error
-    found = compiled.overloads[SIGNATURE.args]
+    found = own.overloads[SIGNATURE.args]
     return int(found.library.get_pointer_to_function(found.fndesc.llvm_cfunc_wrapper_name))
 
 
@@ -103,69 +108,3 @@ def _register_used(function: Any) -> None:
         if getattr(used, "used_in_laws", False):
             _register_used(used)
             register_jitable(used)
-
-
-def _call_law(typing: Any, address: Any, step: Any, numbers: Any, memory: Any, places: Any) -> Any:
-    """Call a law by its address."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        kinds = [context.get_value_type(kind) for kind in signature.args[1:]]
-        code = builder.inttoptr(values[0], ir.FunctionType(context.get_value_type(types.none), kinds).as_pointer())
-        builder.call(code, values[1:])
-        return context.get_dummy_value()
-
-    return types.void(address, step, numbers, memory, places), generate
-
-
-call_law = intrinsic(_call_law)
-
-
-def _apply(laws: Laws, numbers: FloatArray, memory: FloatArray, step: terms_law.Step) -> None:
-    """Let all laws act on a step of one candidate, whose numbers and memory they are."""
-    for n in range(len(laws.address)):
-        rows = laws.rows[n]
-        own = numbers[laws.number[n] : laws.number[n + 1]].reshape(rows, laws.width[n])
-        kept = memory[laws.memory[n] : laws.memory[n + 1]].reshape(rows, laws.kept[n])
-        call_law(laws.address[n], step, own, kept, laws.places[laws.place[n] : laws.place[n + 1]])
-
-
-apply_laws = numba.njit(cache=True, nogil=True, error_model="numpy")(_apply)
-
-
-def _on_samples(
-    laws: Laws,
-    numbers: FloatArray,
-    period: float,
-    position: FloatArray,
-    velocity: FloatArray,
-    torque: FloatArray,
-    load: FloatArray,
-    friction: FloatArray,
-    joint_torque: FloatArray,
-) -> None:
-    """Let laws without memory act on samples (n, j) of a motion, and add what they do to the last two."""
-    none, ones = np.full(position.shape[1], np.nan), np.ones(position.shape[1])
-    memory = np.zeros(0)
-    for i in range(len(position)):
-        gain, motor, low, high = ones.copy(), 0 * ones, -np.inf * ones, np.inf * ones
-        step = terms_law.Step(
-            0.0,
-            period,
-            position[i],
-            position[i],
-            velocity[i],
-            torque[i],
-            load[i],
-            none,
-            ones,
-            gain,
-            motor,
-            joint_torque[i],
-            friction[i],
-            low,
-            high,
-        )
-        apply_laws(laws, numbers, memory, step)
-
-
-on_samples = numba.njit(cache=True, nogil=True, error_model="numpy")(_on_samples)

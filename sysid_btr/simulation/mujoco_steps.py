@@ -7,70 +7,30 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import IntArray
 from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.silence import mujoco_library
 from sysid_btr.simulation.simulator import States
 from sysid_btr.simulation.stepping import (
     STATE,
-    Candidates,
+    Calls,
+    Copies,
     Engine,
-    Plan,
-    act,
-    begin,
-    given_torque,
+    Kept,
+    Thread,
     gives_effort,
     plan_of,
+    roll,
     written,
 )
 from sysid_btr.terms.base import Fields
 
 if TYPE_CHECKING:
     import mujoco
-
-
-class Calls(NamedTuple):
-    """Addresses of MuJoCo's functions, and of a model and data of a thread's own."""
-
-    reset: int
-    step: int
-    model: int
-    data: int
-
-
-class Copies(NamedTuple):
-    """What is copied before a candidate's rollout: where to, from where, and bytes of each row, (n,)."""
-
-    target: IntArray
-    source: IntArray
-    size: IntArray
-
-
-class Thread(NamedTuple):
-    """What a thread simulates with; `warnings` are MuJoCo's counts."""
-
-    calls: Calls
-    copies: Copies
-    engine: Engine
-    warnings: Any
-
-
-class Kept(NamedTuple):
-    """What is kept of candidates: states (m, k, ...) at borders (k,), torques (m, k, j) or none; who failed, (m,)."""
-
-    borders: IntArray
-    qpos: FloatArray
-    qvel: FloatArray
-    effort: FloatArray
-    failed: Any
 
 
 def roll_out(setup: Setup, fields: Fields, borders: IntArray, threads: int) -> States:
@@ -126,59 +86,3 @@ def threads_of(model: mujoco.MjModel, fields: Fields, state: Fields, count: int)
         engine = Engine(*(getattr(data if name in STATE else own, name) for name in Engine._fields))
         calls = Calls(reset, step, own._address, data._address)
         yield Thread(calls, copies, engine, data.warning.number), (own, data, targets, sources)
-
-
-def _pointer(typing: Any, address: Any) -> Any:
-    """An address as a pointer to bytes."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        return builder.inttoptr(values[0], context.get_value_type(signature.return_type))
-
-    return types.CPointer(types.uint8)(address), generate
-
-
-def _call(typing: Any, address: Any, one: Any, other: Any) -> Any:
-    """Call a C function of two pointers, all by their addresses."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        kind = ir.FunctionType(ir.VoidType(), [values[1].type, values[2].type])
-        builder.call(builder.inttoptr(values[0], kind.as_pointer()), values[1:])
-        return context.get_dummy_value()
-
-    return types.void(address, one, other), generate
-
-
-pointer, call = intrinsic(_pointer), intrinsic(_call)
-
-
-def _roll(first: int, last: int, plan: Plan, own: Candidates, thread: Thread, kept: Kept, stop: IntArray) -> None:
-    """Roll out the candidates from `first` to before `last`, unless told to stop."""
-    calls, copies, engine = thread.calls, thread.copies, thread.engine
-    for i in range(first, last):
-        if stop[0]:
-            return
-        call(calls.reset, calls.model, calls.data)
-        for c in range(len(copies.size)):
-            size = copies.size[c]
-            target = numba.carray(pointer(copies.target[c]), (size,))
-            target[:] = numba.carray(pointer(copies.source[c] + i * size), (size,))
-        memory, slot = begin(i, plan, own, engine), 0
-        for k in range(plan.steps + 1):
-            wanted = slot < len(kept.borders) and kept.borders[slot] == k
-            if wanted:
-                kept.qpos[i, slot], kept.qvel[i, slot] = engine.qpos, engine.qvel
-            if k == plan.steps:
-                break
-            act(k, i, plan, own, engine, memory)
-            if wanted:
-                if kept.effort.size:
-                    given_torque(i, plan, own, memory, kept.effort[i, slot])
-                slot += 1
-            call(calls.step, calls.model, calls.data)
-            # MuJoCo has reset the state of one that diverges, which it could not have collided
-            if thread.warnings.any():
-                kept.failed[i] = True
-                break
-
-
-roll = numba.njit(cache=True, nogil=True, error_model="numpy")(_roll)

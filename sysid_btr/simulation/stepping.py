@@ -1,6 +1,7 @@
 """Rollouts step by step, for what an engine cannot do by itself: servos that hold their torque, laws of terms.
 
-All of it is compiled; see `laws` for how a law becomes machine code.
+All of it is compiled, and in one file: machine code is kept beside its source, and made anew when that changes, not when
+another file does. See `laws` for how a law becomes machine code.
 """
 
 from __future__ import annotations
@@ -10,9 +11,12 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.simulation.laws import Laws, apply_laws, table_of
+from sysid_btr.simulation.laws import Laws, compiled, table_of
 from sysid_btr.simulation.servo import ServoLaw
 from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.simulator import States
@@ -183,6 +187,33 @@ def _inputs(setup: Setup) -> tuple[FloatArray, FloatArray]:
     return found[0], found[1]
 
 
+def _call_law(typing: Any, address: Any, step: Any, numbers: Any, memory: Any, places: Any) -> Any:
+    """Call a law by its address."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kinds = [context.get_value_type(kind) for kind in signature.args[1:]]
+        code = builder.inttoptr(values[0], ir.FunctionType(context.get_value_type(types.none), kinds).as_pointer())
+        builder.call(code, values[1:])
+        return context.get_dummy_value()
+
+    return types.void(address, step, numbers, memory, places), generate
+
+
+call_law = intrinsic(_call_law)
+
+
+def _apply(laws: Laws, numbers: FloatArray, memory: FloatArray, step: Step) -> None:
+    """Let all laws act on a step of one candidate, whose numbers and memory they are."""
+    for n in range(len(laws.address)):
+        rows = laws.rows[n]
+        own = numbers[laws.number[n] : laws.number[n + 1]].reshape(rows, laws.width[n])
+        kept = memory[laws.memory[n] : laws.memory[n + 1]].reshape(rows, laws.kept[n])
+        call_law(laws.address[n], step, own, kept, laws.places[laws.place[n] : laws.place[n + 1]])
+
+
+apply_laws = compiled(_apply)
+
+
 def _torque(i: int, plan: Plan, own: Candidates, command: Any, q: Any, v: Any, torque: Any) -> None:
     """Torques (j,) that the servos would like to give."""
     torque[:] = 0.0
@@ -193,7 +224,7 @@ def _torque(i: int, plan: Plan, own: Candidates, command: Any, q: Any, v: Any, t
         torque[j] = total * own.gear[i, d]
 
 
-torque_of = numba.njit(cache=True, nogil=True, error_model="numpy")(_torque)
+torque_of = compiled(_torque)
 
 
 def _given(i: int, plan: Plan, own: Candidates, memory: Memory, torque: Any) -> None:
@@ -205,7 +236,7 @@ def _given(i: int, plan: Plan, own: Candidates, memory: Memory, torque: Any) -> 
         torque[j] = min(max(asked, step[LOW, j]), step[HIGH, j])
 
 
-given_torque = numba.njit(cache=True, nogil=True, error_model="numpy")(_given)
+given_torque = compiled(_given)
 
 
 def _begin(i: int, plan: Plan, own: Candidates, engine: Engine) -> Memory:
@@ -224,7 +255,7 @@ def _begin(i: int, plan: Plan, own: Candidates, engine: Engine) -> Memory:
     return Memory(step, q, v, before, held, np.zeros(plan.laws.memory[-1]))
 
 
-begin = numba.njit(cache=True, nogil=True, error_model="numpy")(_begin)
+begin = compiled(_begin)
 
 
 def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Memory) -> None:
@@ -301,7 +332,138 @@ def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Me
             engine.qfrc_applied[plan.dof[j]] = step[JOINT, j] + known
 
 
-act = numba.njit(cache=True, nogil=True, error_model="numpy")(_act)
+act = compiled(_act)
+
+
+class Calls(NamedTuple):
+    """Addresses of MuJoCo's functions, and of a model and data of a thread's own."""
+
+    reset: int
+    step: int
+    model: int
+    data: int
+
+
+class Copies(NamedTuple):
+    """What is copied before a candidate's rollout: where to, from where, and bytes of each row, (n,)."""
+
+    target: IntArray
+    source: IntArray
+    size: IntArray
+
+
+class Thread(NamedTuple):
+    """What a thread simulates with; `warnings` are MuJoCo's counts."""
+
+    calls: Calls
+    copies: Copies
+    engine: Engine
+    warnings: Any
+
+
+class Kept(NamedTuple):
+    """What is kept of candidates: states (m, k, ...) at borders (k,), torques (m, k, j) or none; who failed, (m,)."""
+
+    borders: IntArray
+    qpos: FloatArray
+    qvel: FloatArray
+    effort: FloatArray
+    failed: Any
+
+
+def _pointer(typing: Any, address: Any) -> Any:
+    """An address as a pointer to bytes."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(types.uint8)(address), generate
+
+
+def _call(typing: Any, address: Any, one: Any, other: Any) -> Any:
+    """Call a C function of two pointers, all by their addresses."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [values[1].type, values[2].type])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), values[1:])
+        return context.get_dummy_value()
+
+    return types.void(address, one, other), generate
+
+
+pointer, call = intrinsic(_pointer), intrinsic(_call)
+
+
+def _roll(first: int, last: int, plan: Plan, own: Candidates, thread: Thread, kept: Kept, stop: IntArray) -> None:
+    """Roll out the candidates from `first` to before `last`, unless told to stop."""
+    calls, copies, engine = thread.calls, thread.copies, thread.engine
+    for i in range(first, last):
+        if stop[0]:
+            return
+        call(calls.reset, calls.model, calls.data)
+        for c in range(len(copies.size)):
+            size = copies.size[c]
+            target = numba.carray(pointer(copies.target[c]), (size,))
+            target[:] = numba.carray(pointer(copies.source[c] + i * size), (size,))
+        memory, slot = begin(i, plan, own, engine), 0
+        for k in range(plan.steps + 1):
+            wanted = slot < len(kept.borders) and kept.borders[slot] == k
+            if wanted:
+                kept.qpos[i, slot], kept.qvel[i, slot] = engine.qpos, engine.qvel
+            if k == plan.steps:
+                break
+            act(k, i, plan, own, engine, memory)
+            if wanted:
+                if kept.effort.size:
+                    given_torque(i, plan, own, memory, kept.effort[i, slot])
+                slot += 1
+            call(calls.step, calls.model, calls.data)
+            # MuJoCo has reset the state of one that diverges, which it could not have collided
+            if thread.warnings.any():
+                kept.failed[i] = True
+                break
+
+
+roll = compiled(_roll)
+
+
+def _on_samples(
+    laws: Laws,
+    numbers: FloatArray,
+    period: float,
+    position: FloatArray,
+    velocity: FloatArray,
+    torque: FloatArray,
+    load: FloatArray,
+    friction: FloatArray,
+    joint_torque: FloatArray,
+) -> None:
+    """Let laws without memory act on samples (n, j) of a motion, and add what they do to the last two."""
+    none, ones = np.full(position.shape[1], np.nan), np.ones(position.shape[1])
+    memory = np.zeros(0)
+    for i in range(len(position)):
+        gain, motor, low, high = ones.copy(), 0 * ones, -np.inf * ones, np.inf * ones
+        step = Step(
+            0.0,
+            period,
+            position[i],
+            position[i],
+            velocity[i],
+            torque[i],
+            load[i],
+            none,
+            ones,
+            gain,
+            motor,
+            joint_torque[i],
+            friction[i],
+            low,
+            high,
+        )
+        apply_laws(laws, numbers, memory, step)
+
+
+on_samples = compiled(_on_samples)
 
 
 def step_through(setup: Setup, borders: IntArray, arrays: Callable[[str], Any], advance: Callable[[], None]) -> States:

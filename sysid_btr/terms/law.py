@@ -1,7 +1,8 @@
 """Laws of terms: what acts at every step of a simulation, for one candidate, in the Python that numba compiles.
 
 A law is a static method of its term. It runs between the steps of compiled code, so it may use numbers, arrays, `math`,
-numpy's functions of scalars, and plain functions of its own module that are marked by `used_in_laws`.
+numpy's functions of scalars, and plain functions of its own module that are marked by `used_in_laws`. Machine code is
+kept beside a law's source: after a change of this file, which all of them use, `make clean`.
 """
 
 from __future__ import annotations
