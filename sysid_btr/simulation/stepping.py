@@ -1,7 +1,7 @@
 """Rollouts step by step, for what an engine cannot do by itself: servos that hold their torque, laws of terms.
 
-All of it is compiled, and in one file: machine code is kept beside its source, and made anew when that changes, not when
-another file does. See `laws` for how a law becomes machine code.
+All of it is compiled, and in one file: machine code is kept beside its source, and made anew when that changes and not
+when another file does. See `laws` for how a law becomes machine code.
 """
 
 from __future__ import annotations
