@@ -431,7 +431,7 @@ def test_a_speed_torque_limit_does_not_limit_braking() -> None:
 def test_a_slew_limit_is_a_ramp_of_the_command() -> None:
     time = np.arange(401) * FINE.timestep
     step = make_log(time, {"command.arm": np.where(time >= 0.5, 1.0, 0.0)})
-    ramp = make_log(time, {"command.arm": np.clip(2.0 * (time - 0.5 + FINE.timestep), 0.0, 1.0)})
+    ramp = make_log(time, {"command.arm": np.clip(2.0 * (time - 0.5 + 0.5 * FINE.timestep), 0.0, 1.0)})
     np.testing.assert_allclose(
         position(pendulum(), step, [at_arm(SlewLimit)], [2.0]), position(pendulum(), ramp), atol=1e-9
     )

@@ -16,7 +16,7 @@ FAINT = 1e-3
 """How near to 0 and 1 a share is believed."""
 
 UNSIZED = 0.5
-"""Most that is said of a name none of whose numbers is identifiable: it is not more likely than not."""
+"""Most that is said of a name whose size may be nothing: it is not more likely than not."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Calibration:
     explained: float
 
     def certainty(self, evidence: Mapping[str, float], *, sized: bool = True) -> float:
-        """Probability, 0 to 1, from the evidence of an effect, of which any number is identifiable if it is `sized`."""
+        """Probability, 0 to 1, from the evidence of an effect, of which some number is not nothing if it is `sized`."""
         total = (
             self.constant
             + self.family * log_odds(evidence["family"])

@@ -318,6 +318,11 @@ def distance_from_nothing(found: Estimate, neutral: float) -> float:
     return abs(found.value - neutral) / max(found.std, 1e-300)
 
 
+def differs_from(found: Estimate, neutral: float) -> bool:
+    """Whether an amount is identifiable and its interval leaves out the value that does nothing."""
+    return found.identifiable != "no" and not found.ci95[0] <= neutral <= found.ci95[1]
+
+
 def predicts_as_well(rules: Selection, without: Fitted, now: Fitted) -> bool:
     """Whether held-out data do not miss what may be nothing."""
     return without.misfit <= now.misfit + rules.rival

@@ -8,7 +8,7 @@ from sysid_btr.diagnosis import certainty
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, Verdict
 from sysid_btr.diagnosis.evidence import Evidence, left_where_it_acts, share_explained
 from sysid_btr.diagnosis.messages import message_of, sentence_of
-from sysid_btr.diagnosis.selection import Selection, is_log_explained, something_left, verdict_limit
+from sysid_btr.diagnosis.selection import Selection, differs_from, is_log_explained, something_left, verdict_limit
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
 from sysid_btr.identify.intervals import Estimate
@@ -89,7 +89,7 @@ def _named(
     now = state.fitted
     left = left_where_it_acts(off, now)
     known = {"family": evidence.family, "place": evidence.place, "left": left}
-    sized = any(estimate.identifiable != "no" for estimate in own)
+    sized = any(differs_from(estimate, nothing) for estimate, nothing in zip(own, effect.neutral, strict=True))
     sure = certainty.STANDARD.certainty(known, sized=sized)
     rest = sum(evidence.others.values())
     otherwise = {name: (1 - sure) * weight / max(rest, evidence.family) for name, weight in evidence.others.items()}

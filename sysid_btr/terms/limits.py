@@ -119,7 +119,7 @@ class SpeedTorqueLimit(Effect):
 class SlewLimit(Effect):
     """A servo that follows its command no faster than a certain rate.
 
-    Command: limited in its rate before the replay; neutral above every rate of the log.
+    Command: limited in its rate before the replay, by its mean over each step; neutral above every rate of the log.
     """
 
     name: ClassVar[str] = "slew_limit"
@@ -154,6 +154,10 @@ class SlewLimit(Effect):
             return shaped
         now = wanted[:, 0]
         for k in range(wanted.shape[1]):
-            now = np.where(off, wanted[:, k], now + np.clip(wanted[:, k] - now, -most, most))
-            shaped[:, k, columns] = now
+            far = wanted[:, k] - now
+            step = np.where(off, far, np.clip(far, -most, most))
+            # of a step in which it is on its way the drive sees the mean
+            on_its_way = np.minimum(np.abs(far) / most, 1.0)
+            shaped[:, k, columns] = now + step * (1 - 0.5 * on_its_way)
+            now = now + step
         return shaped
