@@ -86,9 +86,9 @@ def read_logs(paths: Iterable[Path], robot: Robot | None = None, *, motions: boo
     as wrong, unless `motions` are wanted.
     """
     from sysid_btr.io.parquet import read_log
-    from sysid_btr.terms.drives import joint_drives
+    from sysid_btr.terms.drives import drive_kinds
 
-    drives = None if robot is None else {drive.joint: drive.kind for drive in joint_drives(robot.model)}
+    drives = None if robot is None else drive_kinds(robot.model)
     logs, problems = [], []
     for path in paths:
         try:

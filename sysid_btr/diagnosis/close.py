@@ -32,13 +32,13 @@ from sysid_btr.terms.effect import COMMANDS, GROUND, Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.library import select_effects
 
-OF_DRIVES = ("delay", "gain", "saturation", "servo law", "supply")
-"""Families of what a drive makes of its command: none where the torque that it gave moves the model."""
-
 if TYPE_CHECKING:
     from numpy.random import Generator
 
     from sysid_btr.io.log import Log
+
+OF_DRIVES = ("delay", "gain", "saturation", "servo law", "supply")
+"""Families of what a drive makes of its command: none where the torque that it gave moves the model."""
 
 
 @shows_progress("close")

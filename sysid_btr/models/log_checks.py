@@ -15,7 +15,7 @@ from sysid_btr.models.commands import FED_FORWARD, command_columns, commanded, d
 from sysid_btr.models.pose import standing
 from sysid_btr.models.robot import Robot, joint_names, joint_ranges
 from sysid_btr.models.ties import broken_ties
-from sysid_btr.terms.drives import Drive, crowded_joints, joint_drives, own_controls
+from sysid_btr.terms.drives import Drive, crowded_joints, drive_kinds, joint_drives, own_controls
 
 if TYPE_CHECKING:
     import mujoco
@@ -29,12 +29,11 @@ recorded Nao are within 0.06 to 0.09; the torques of the DFKI double pendulum co
 def check_log(robot: Robot, log: Log) -> tuple[Problem, ...]:
     """Problems of a log for one robot, worst first: the one list that all verbs have."""
     robot = robot.for_log(log)
-    drives = joint_drives(robot.model)
     content = _of_content(
         log,
         joints=joint_names(robot),
         ranges=joint_ranges(robot),
-        drives={drive.joint: drive.kind for drive in drives},
+        drives=drive_kinds(robot.model),
         controls=tuple(own_controls(robot.model)),
         at=standing(robot, log),
     )

@@ -72,6 +72,11 @@ class Setup:
     def steps(self) -> int:
         return int(self.command.shape[1])
 
+    @property
+    def acts(self) -> frozenset[str]:
+        """What laws change beside the torques at joints, see `Term.law_acts`."""
+        return frozenset(name for law in self.laws for name in law.term.law_acts)
+
     def ctrl(self, steps: slice) -> FloatArray:
         """(m, k, nu) MuJoCo's ctrl in some of the steps."""
         index, command = self.index, self.command[:, steps]

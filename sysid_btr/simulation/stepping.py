@@ -119,7 +119,7 @@ class Memory(NamedTuple):
 def plan_of(setup: Setup) -> tuple[Plan, Candidates]:
     """A setup as compiled code takes it."""
     batch, index = setup.batch, setup.index
-    law, acts = ServoLaw.of(batch), frozenset(name for law in setup.laws for name in law.term.law_acts)
+    law, acts = ServoLaw.of(batch), setup.acts
     laws, numbers = table_of(setup.laws, setup.size)
     actuator = index.actuator[law.driven]
     command, command_of = _apart(setup.command)
@@ -155,8 +155,7 @@ def plan_of(setup: Setup) -> tuple[Plan, Candidates]:
 
 def written(setup: Setup) -> tuple[str, ...]:
     """Fields of the model that the steps of a setup write, beside those that candidates differ in."""
-    acts = {name for law in setup.laws for name in law.term.law_acts}
-    held = bool(setup.held_steps)
+    acts, held = setup.acts, bool(setup.held_steps)
     names = {
         "dof_frictionloss": "friction" in acts,
         "actuator_gainprm": held or "servo" in acts,
@@ -202,12 +201,28 @@ def _call_law(typing: Any, address: Any, step: Any, numbers: Any, memory: Any, p
 call_law = intrinsic(_call_law)
 
 
-def _apply(laws: Laws, numbers: FloatArray, memory: FloatArray, step: Step) -> None:
-    """Let all laws act on a step of one candidate, whose numbers and memory they are."""
+def _apply(laws: Laws, numbers: FloatArray, memory: FloatArray, time: float, timestep: float, rows: Any) -> None:
+    """Let all laws act on the arrays (ROWS, j) of a step of one candidate, whose numbers and memory they are."""
+    step = Step(
+        time,
+        timestep,
+        rows[COMMAND],
+        rows[QPOS],
+        rows[QVEL],
+        rows[TORQUE],
+        rows[LOAD],
+        rows[VOLTAGE],
+        rows[ENABLED],
+        rows[GAIN],
+        rows[MOTOR],
+        rows[JOINT],
+        rows[FRICTION],
+        rows[LOW],
+        rows[HIGH],
+    )
     for n in range(len(laws.address)):
-        rows = laws.rows[n]
-        own = numbers[laws.number[n] : laws.number[n + 1]].reshape(rows, laws.width[n])
-        kept = memory[laws.memory[n] : laws.memory[n + 1]].reshape(rows, laws.kept[n])
+        own = numbers[laws.number[n] : laws.number[n + 1]].reshape(laws.rows[n], laws.width[n])
+        kept = memory[laws.memory[n] : laws.memory[n + 1]].reshape(laws.rows[n], laws.kept[n])
         call_law(laws.address[n], step, own, kept, laws.places[laws.place[n] : laws.place[n + 1]])
 
 
@@ -279,24 +294,7 @@ def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Me
             step[ENABLED] = own.enabled[i, k]
         torque_of(i, plan, own, step[COMMAND], step[QPOS], step[QVEL], step[TORQUE])
         step[TORQUE] = np.minimum(np.maximum(step[TORQUE], step[LOW]), step[HIGH])
-        seen = Step(
-            k * h + 0.5 * h,
-            h,
-            step[COMMAND],
-            step[QPOS],
-            step[QVEL],
-            step[TORQUE],
-            step[LOAD],
-            step[VOLTAGE],
-            step[ENABLED],
-            step[GAIN],
-            step[MOTOR],
-            step[JOINT],
-            step[FRICTION],
-            step[LOW],
-            step[HIGH],
-        )
-        apply_laws(plan.laws, own.numbers[i], memory.laws, seen)
+        apply_laws(plan.laws, own.numbers[i], memory.laws, k * h + 0.5 * h, h, step)
         if plan.friction:
             for j in range(len(q)):
                 engine.dof_frictionloss[plan.dof[j]] = max(own.own_friction[i, j] + step[FRICTION, j], 0.0)
@@ -439,28 +437,15 @@ def _on_samples(
     joint_torque: FloatArray,
 ) -> None:
     """Let laws without memory act on samples (n, j) of a motion, and add what they do to the last two."""
-    none, ones = np.full(position.shape[1], np.nan), np.ones(position.shape[1])
-    memory = np.zeros(0)
+    rows, memory = np.zeros((ROWS, position.shape[1])), np.zeros(0)
+    rows[VOLTAGE], rows[ENABLED] = np.nan, 1.0
     for i in range(len(position)):
-        gain, motor, low, high = ones.copy(), 0 * ones, -np.inf * ones, np.inf * ones
-        step = Step(
-            0.0,
-            period,
-            position[i],
-            position[i],
-            velocity[i],
-            torque[i],
-            load[i],
-            none,
-            ones,
-            gain,
-            motor,
-            joint_torque[i],
-            friction[i],
-            low,
-            high,
-        )
-        apply_laws(laws, numbers, memory, step)
+        rows[COMMAND], rows[QPOS], rows[QVEL] = position[i], position[i], velocity[i]
+        rows[TORQUE], rows[LOAD] = torque[i], load[i]
+        rows[GAIN], rows[MOTOR], rows[LOW], rows[HIGH] = 1.0, 0.0, -np.inf, np.inf
+        rows[JOINT], rows[FRICTION] = joint_torque[i], friction[i]
+        apply_laws(laws, numbers, memory, 0.0, period, rows)
+        joint_torque[i], friction[i] = rows[JOINT], rows[FRICTION]
 
 
 on_samples = compiled(_on_samples)
@@ -503,5 +488,5 @@ def step_through(setup: Setup, borders: IntArray, arrays: Callable[[str], Any], 
 
 def gives_effort(setup: Setup) -> bool:
     """Whether torques are asked for that are others than those of the servos' own law in the present state."""
-    acts = {name for law in setup.laws for name in law.term.law_acts}
-    return setup.effort and bool(setup.laws) and (setup.held_steps > 0 or not acts.isdisjoint({"servo", "limit"}))
+    alters = setup.held_steps > 0 or not setup.acts.isdisjoint({"servo", "limit"})
+    return setup.effort and bool(setup.laws) and alters

@@ -36,6 +36,11 @@ class Drive:
     scale: float
 
 
+def drive_kinds(model: mujoco.MjModel) -> dict[str, DriveKind]:
+    """What the command of each joint with a drive is, by joint."""
+    return {drive.joint: drive.kind for drive in joint_drives(model)}
+
+
 def joint_drives(model: mujoco.MjModel) -> tuple[Drive, ...]:
     """Drives of joints that have one actuator whose command has a meaning, in the order of the actuators."""
     acted = _acted_joints(model)
