@@ -73,15 +73,21 @@ class InverseReplay(Replay):
         armature, damping, friction = (batch.read(name)[:, self.index.dof] for name in fields)
         shared, applied = self._tendon_friction(batch), self._applied(batch, pairs)
         laws = tuple(law for law in laws_of(self.index, pairs) if not needs_history(type(law.term)))
-        act = _acting(laws, motion, m)
-        for i, rigid in enumerate(self._rigid(batch)):
+        acting = _acting(laws, motion, m)
+        for i, (rigid, act) in enumerate(zip(self._rigid(batch), acting, strict=True)):
             rotors = armature[i] * motion.acceleration
             smooth = rigid.torque + rotors + damping[i] * motion.velocity + shared[min(i, len(shared) - 1)]
             effort[i] = smooth + friction[i] * motion.direction
-            for _ in range(ROUNDS if laws else 0):
+            if act is None:
+                continue
+            for _ in range(ROUNDS):
                 # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
-                rubbed, pushed = act(i, effort[i], rigid.load + rotors)
-                effort[i] = smooth + np.maximum(friction[i] + rubbed, 0.0) * motion.direction - pushed
+                rubbed, pushed = act(effort[i], rigid.load + rotors)
+                found = smooth + np.maximum(friction[i] + rubbed, 0.0) * motion.direction - pushed
+                settled = np.array_equal(found, effort[i])
+                effort[i] = found
+                if settled:
+                    break
         outputs = Outputs(
             motion.time,
             np.array(np.broadcast_to(motion.position, shape)),
@@ -147,28 +153,28 @@ class InverseReplay(Replay):
         return applied
 
 
-Acting = Callable[[int, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Candidate, torques of its drives and loads, (n, j) each -> friction and torques at the joints that laws add."""
+Acting = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""Torques of the drives and loads, (n, j) each -> friction and torques at the joints that laws add."""
 
 
-def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> Acting:
-    """What laws do on the samples of a motion."""
+def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[Acting | None]:
+    """What laws do on the samples of a motion, candidate by candidate; None where they do nothing."""
     if not laws:
-        return lambda candidate, torque, load: (np.zeros(torque.shape), np.zeros(torque.shape))
+        return [None] * candidates
     # imports what compiles laws, which takes a second
     from sysid_btr.simulation.laws import table_of
     from sysid_btr.simulation.stepping import on_samples
 
-    table, numbers = table_of(laws, candidates)
+    table, numbers, awake = table_of(laws, candidates)
     position, velocity = (np.ascontiguousarray(x) for x in (motion.position, motion.velocity))
 
     def act(candidate: int, torque: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray]:
         friction, pushed = np.zeros(position.shape), np.zeros(position.shape)
-        own = numbers[candidate]
-        on_samples(table, own, motion.period, position, velocity, torque, load, friction, pushed)
+        own = numbers[candidate], awake[candidate]
+        on_samples(table, *own, motion.period, position, velocity, torque, load, friction, pushed)
         return friction, pushed
 
-    return act
+    return [partial(act, i) if awake[i].any() else None for i in range(candidates)]
 
 
 def needs_history(term: type[Term]) -> bool:

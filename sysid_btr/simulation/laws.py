@@ -13,7 +13,7 @@ from numba import types
 from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import UsageError
 from sysid_btr.simulation.setup import Law
 from sysid_btr.terms import law as terms_law
@@ -44,8 +44,11 @@ class Laws(NamedTuple):
     places: IntArray
 
 
-def table_of(laws: Sequence[Law], candidates: int) -> tuple[Laws, FloatArray]:
-    """Laws and, for each candidate, their numbers (candidates, n) end to end."""
+def table_of(laws: Sequence[Law], candidates: int) -> tuple[Laws, FloatArray, BoolArray]:
+    """Laws (n,) and, for each candidate, their numbers (candidates, k) end to end, and which of them do anything.
+
+    What a law at its neutral values does is nothing, so it is not called.
+    """
     numbers = [law.term.law_numbers(law.values) for law in laws]
     rows, width = ([n.shape[axis] for n in numbers] for axis in (1, 2))
     kept, places = [law.term.law_memory for law in laws], [law.places for law in laws]
@@ -59,7 +62,13 @@ def table_of(laws: Sequence[Law], candidates: int) -> tuple[Laws, FloatArray]:
         _ends([len(p) for p in places]),
         _whole(np.concatenate([np.zeros(0), *places])),
     )
-    return table, np.concatenate([np.zeros((candidates, 0)), *(n.reshape(candidates, -1) for n in numbers)], axis=1)
+    flat = np.concatenate([np.zeros((candidates, 0)), *(n.reshape(candidates, -1) for n in numbers)], axis=1)
+    awake = np.ones((candidates, len(laws)), dtype=np.bool_)
+    for n, law in enumerate(laws):
+        neutral = law.term.neutral
+        if len(neutral):
+            awake[:, n] = (law.values != law.term.spread(neutral[None])).any(axis=(1, 2))
+    return table, flat, awake
 
 
 def _whole(values: Any) -> IntArray:

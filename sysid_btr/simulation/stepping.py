@@ -59,7 +59,7 @@ class Candidates(NamedTuple):
     voltage, enabled, applied, control : (m, steps, j or c), or (0, 0, 0) where there are none.
     gear, gain, constant, stiffness, damping, least, most : (m, d) of the servos, see `ServoLaw`.
     low, high : (m, j).
-    numbers : (m, n) of the laws.
+    numbers, awake : (m, n) of the laws, and (m, laws) which of these do anything.
     own_gain, own_bias, own_friction : actuator_gainprm and actuator_biasprm (m, d, 10), dof_frictionloss (m, j), as
         they are without laws.
     """
@@ -80,6 +80,7 @@ class Candidates(NamedTuple):
     low: FloatArray
     high: FloatArray
     numbers: FloatArray
+    awake: BoolArray
     own_gain: FloatArray
     own_bias: FloatArray
     own_friction: FloatArray
@@ -120,7 +121,7 @@ def plan_of(setup: Setup) -> tuple[Plan, Candidates]:
     """A setup as compiled code takes it."""
     batch, index = setup.batch, setup.index
     law, acts = ServoLaw.of(batch), setup.acts
-    laws, numbers = table_of(setup.laws, setup.size)
+    laws, numbers, awake = table_of(setup.laws, setup.size)
     actuator = index.actuator[law.driven]
     command, command_of = _apart(setup.command)
     plan = Plan(
@@ -146,11 +147,13 @@ def plan_of(setup: Setup) -> tuple[Plan, Candidates]:
         *(law.gear, law.gain, law.constant, law.stiffness, law.damping),
         *(np.broadcast_to(x, shape) for x in (law.least, law.most)),
         *(law.low, law.high, numbers),
+    )
+    as_they_are = (
         *(batch.read(name)[:, actuator] for name in ("actuator_gainprm", "actuator_biasprm")),
         batch.read("dof_frictionloss")[:, index.dof],
     )
-    rest = [np.ascontiguousarray(x, dtype=np.float64) for x in floats]
-    return plan, Candidates(command, command_of, *rest)
+    first, last = ([np.ascontiguousarray(x, dtype=np.float64) for x in xs] for xs in (floats, as_they_are))
+    return plan, Candidates(command, command_of, *first, awake, *last)
 
 
 def written(setup: Setup) -> tuple[str, ...]:
@@ -201,8 +204,8 @@ def _call_law(typing: Any, address: Any, step: Any, numbers: Any, memory: Any, p
 call_law = intrinsic(_call_law)
 
 
-def _apply(laws: Laws, numbers: FloatArray, memory: FloatArray, time: float, timestep: float, rows: Any) -> None:
-    """Let all laws act on the arrays (ROWS, j) of a step of one candidate, whose numbers and memory they are."""
+def _apply(laws: Laws, numbers: Any, awake: Any, memory: Any, time: float, timestep: float, rows: Any) -> None:
+    """Let laws act on the arrays (ROWS, j) of a step of one candidate, whose numbers and memory they are."""
     step = Step(
         time,
         timestep,
@@ -221,6 +224,8 @@ def _apply(laws: Laws, numbers: FloatArray, memory: FloatArray, time: float, tim
         rows[HIGH],
     )
     for n in range(len(laws.address)):
+        if not awake[n]:
+            continue
         own = numbers[laws.number[n] : laws.number[n + 1]].reshape(laws.rows[n], laws.width[n])
         kept = memory[laws.memory[n] : laws.memory[n + 1]].reshape(laws.rows[n], laws.kept[n])
         call_law(laws.address[n], step, own, kept, laws.places[laws.place[n] : laws.place[n + 1]])
@@ -294,7 +299,7 @@ def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Me
             step[ENABLED] = own.enabled[i, k]
         torque_of(i, plan, own, step[COMMAND], step[QPOS], step[QVEL], step[TORQUE])
         step[TORQUE] = np.minimum(np.maximum(step[TORQUE], step[LOW]), step[HIGH])
-        apply_laws(plan.laws, own.numbers[i], memory.laws, k * h + 0.5 * h, h, step)
+        apply_laws(plan.laws, own.numbers[i], own.awake[i], memory.laws, k * h + 0.5 * h, h, step)
         if plan.friction:
             for j in range(len(q)):
                 engine.dof_frictionloss[plan.dof[j]] = max(own.own_friction[i, j] + step[FRICTION, j], 0.0)
@@ -428,6 +433,7 @@ roll = compiled(_roll)
 def _on_samples(
     laws: Laws,
     numbers: FloatArray,
+    awake: BoolArray,
     period: float,
     position: FloatArray,
     velocity: FloatArray,
@@ -444,7 +450,7 @@ def _on_samples(
         rows[TORQUE], rows[LOAD] = torque[i], load[i]
         rows[GAIN], rows[MOTOR], rows[LOW], rows[HIGH] = 1.0, 0.0, -np.inf, np.inf
         rows[JOINT], rows[FRICTION] = joint_torque[i], friction[i]
-        apply_laws(laws, numbers, memory, 0.0, period, rows)
+        apply_laws(laws, numbers, awake, memory, 0.0, period, rows)
         joint_torque[i], friction[i] = rows[JOINT], rows[FRICTION]
 
 
