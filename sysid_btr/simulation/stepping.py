@@ -56,16 +56,18 @@ class Candidates(NamedTuple):
     Attributes
     ----------
     command, command_of : (u, steps, j), and which of them each has, (m,).
+    awake : (m, laws) which laws do anything.
     voltage, enabled, applied, control : (m, steps, j or c), or (0, 0, 0) where there are none.
     gear, gain, constant, stiffness, damping, least, most : (m, d) of the servos, see `ServoLaw`.
     low, high : (m, j).
-    numbers, awake : (m, n) of the laws, and (m, laws) which of these do anything.
+    numbers : (m, n) of the laws.
     own_gain, own_bias, own_friction : actuator_gainprm and actuator_biasprm (m, d, 10), dof_frictionloss (m, j), as
         they are without laws.
     """
 
     command: FloatArray
     command_of: IntArray
+    awake: BoolArray
     voltage: FloatArray
     enabled: FloatArray
     applied: FloatArray
@@ -80,7 +82,6 @@ class Candidates(NamedTuple):
     low: FloatArray
     high: FloatArray
     numbers: FloatArray
-    awake: BoolArray
     own_gain: FloatArray
     own_bias: FloatArray
     own_friction: FloatArray
@@ -147,13 +148,11 @@ def plan_of(setup: Setup) -> tuple[Plan, Candidates]:
         *(law.gear, law.gain, law.constant, law.stiffness, law.damping),
         *(np.broadcast_to(x, shape) for x in (law.least, law.most)),
         *(law.low, law.high, numbers),
-    )
-    as_they_are = (
         *(batch.read(name)[:, actuator] for name in ("actuator_gainprm", "actuator_biasprm")),
         batch.read("dof_frictionloss")[:, index.dof],
     )
-    first, last = ([np.ascontiguousarray(x, dtype=np.float64) for x in xs] for xs in (floats, as_they_are))
-    return plan, Candidates(command, command_of, *first, awake, *last)
+    rest = [np.ascontiguousarray(x, dtype=np.float64) for x in floats]
+    return plan, Candidates(command, command_of, awake, *rest)
 
 
 def written(setup: Setup) -> tuple[str, ...]:
