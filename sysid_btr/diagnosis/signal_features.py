@@ -17,6 +17,8 @@ BINS = 40
 REPEATS = 4
 """Times that a period must fit into a signal."""
 MOST_PERIODS = 6000
+NEGLIGIBLE = 1e-8
+"""Singular value, relative to the largest, of a direction that columns of a design do not have."""
 SHORTER = 0.8
 """A shorter period is preferred if it explains at least this fraction of what the best one does."""
 
@@ -89,7 +91,7 @@ def best_box(signal: FloatArray, shortest: int) -> Box | None:
 
 def fold(signal: FloatArray, time: FloatArray, period: float, bins: int = BINS) -> tuple[FloatArray, FloatArray]:
     """Mean of a signal over its phase in a period, and how many samples each mean has; (bins,) each."""
-    label = (np.mod(time / period, 1.0) * bins).astype(np.int64) % bins
+    label = np.floor(time * (bins / period)).astype(np.int64) % bins
     count = np.bincount(label, minlength=bins)
     mean = np.bincount(label, signal, bins) / np.maximum(count, 1)
     return mean, count.astype(float)
@@ -235,23 +237,30 @@ def without(signal: FloatArray, design: FloatArray, by: BoolArray | None = None)
     `by` are the samples (n,) that determine the model; None for all.
     """
     rows = slice(None) if by is None else by
-    x = np.column_stack([np.ones(len(design)), design])
-    size = np.linalg.norm(x, axis=0)
-    x = x / np.where(size > 0, size, 1.0)
-    return np.asarray(signal - x @ np.linalg.lstsq(x[rows], signal[rows], rcond=1e-8)[0])
+    x = _unit_columns(design)
+    return np.asarray(signal - x @ np.linalg.lstsq(x[rows], signal[rows], rcond=NEGLIGIBLE)[0])
 
 
 def line_shares(signal: FloatArray, sines: Sequence[FloatArray], design: FloatArray) -> FloatArray:
     """Share of a signal's variance that each pair of columns explains beyond a design."""
-    base = without(signal, design)
+    whole, values, _ = np.linalg.svd(_unit_columns(design), full_matrices=False)
+    basis = whole[:, values > NEGLIGIBLE * values[0]]
+    base = signal - basis @ (basis.T @ signal)
     total = float(base @ base)
     shares = []
     for pair in sines:
-        rest = without(pair, design)
+        rest = pair - basis @ (basis.T @ pair)
         gram = rest.T @ rest + 1e-9 * float(np.sum(pair**2)) * np.eye(pair.shape[1])
         inner = rest.T @ base
         shares.append(float(inner @ np.linalg.solve(gram, inner)) / max(total, 1e-300))
     return np.array(shares)
+
+
+def _unit_columns(design: FloatArray) -> FloatArray:
+    """A constant and the columns (n, k) of a design, each of unit length."""
+    x = np.column_stack([np.ones(len(design)), design])
+    size = np.linalg.norm(x, axis=0)
+    return np.asarray(x / np.where(size > 0, size, 1.0))
 
 
 def memory(signal: FloatArray) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.deferred import cheaper
 from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fixing import fix_unidentifiable
@@ -63,7 +64,8 @@ def with_intervals(state: State, rules: Selection) -> State:
         study = replace(study, numerics=study.numerics.halved())
         state = replace(state, fitted=refit(study, model, iterations=4))
     if known is None:
-        found, _ = followed(problem.parameters, found, problem, model.values, jacobian)
+        near = cheaper(problem, study.cheap, model.values)
+        found, _ = followed(problem.parameters, found, near, model.values, jacobian)
     values, found, _ = fix_unidentifiable(problem, model.values, found, jacobian, known)
     found = with_sensitivity(found, problem, slopes)
     last = judge(study, model.at(values))

@@ -46,8 +46,13 @@ _ROUGH_FRACTION = 1e-1  # tolerated instead where no step lowers the loss: 0.3 s
 _SLOW_FRACTION = 0.5  # a step that gains less than this, in the same unit ...
 _MANY = 1000  # residuals, from which on their mean square says what noise is
 _KEPT = 0.1  # ... and less than this share of what it promised tells of a rough objective, not of a way to go
+_KEEPS = 0.25  # of what it promised: a step that gains less is too long (Nocedal and Wright 2006, algorithm 4.1)
 _LOSS_MISMATCH = 1e-6
 _FIRST_DAMPING = 0.1
+
+
+_Ladder = tuple[tuple[FloatArray, float], ...]
+"""Batches of damping factors, and the share of the gain it promised by which a step makes those after it needless."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,34 +423,35 @@ class LeastSquares:
         worth = max(_SLOW_FRACTION, self.least_gain) * model.deviation
         return _KEPT * promised if stumbled else min(worth, _KEPT * promised)
 
-    def _ladder(self, centre: float, *, trust: bool) -> tuple[FloatArray, ...]:
-        """Damping factors about the one that worked last, in the batches to try them in."""
-        first = np.append(0.0, centre * np.array(self.damping))
-        # Once undamped steps work they go on working: two candidates do, and the rest is kept for when not.
-        batches = (first[:2], first[2:]) if trust else (first,)
-        return (*batches, first[-1] * np.array(self.rescue))
+    def _ladder(self, centre: float, *, trust: bool) -> _Ladder:
+        """Damping factors about the one that worked last, in the batches to try them in.
+
+        Two candidates do where the undamped step works, and the rest is kept for when it does not.
+        """
+        near = centre * np.array(self.damping)
+        # once undamped steps work they go on working
+        beside, enough = (0, 0.0) if trust else (int(np.argmin(np.abs(near - centre))), _KEEPS)
+        rest = np.delete(near, beside)
+        return (np.array([0.0, near[beside]]), enough), (rest, 0.0), (near[-1] * np.array(self.rescue), 0.0)
 
 
 def _climb(
-    evaluator: Evaluator,
-    model: _Linear,
-    u: FloatArray,
-    loss: float,
-    rank_tolerance: float,
-    ladder: tuple[FloatArray, ...],
-    note: str,
+    evaluator: Evaluator, model: _Linear, u: FloatArray, loss: float, rank_tolerance: float, ladder: _Ladder, note: str
 ) -> tuple[FloatArray, float, float] | None:
-    """The best point of the first batch that lowers the loss, its loss and its damping, or None."""
-    for factors in ladder:
+    """The best point of the batches up to the first that lowers the loss enough, its loss and its damping, or None."""
+    found: tuple[FloatArray, float, float] | None = None
+    for factors, enough in ladder:
         if not len(factors):
             continue
         steps = [model.step(float(factor), -u, 1.0 - u, rank_tolerance) for factor in factors]
         trials = np.clip(u + np.array(steps), 0.0, 1.0)
         losses = evaluator.loss(evaluator.box.leave(trials), note)
         i = int(np.argmin(losses))
-        if losses[i] < loss:
-            return trials[i], float(losses[i]), float(factors[i])
-    return None
+        if losses[i] < (loss if found is None else found[1]):
+            found = trials[i], float(losses[i]), float(factors[i])
+        if found is not None and loss - found[1] >= enough * model.predicted(found[0] - u):
+            break
+    return found
 
 
 def linearise(

@@ -79,6 +79,15 @@ def corrected(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> Co
     return Corrected(rough, pair[0], np.nan_to_num(pair[0] - pair[1]), values)
 
 
+def cheaper(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> ReplayProblem | Corrected:
+    """The problem under a cheap integrator, right at `values` (p,), where that rises about as fast around them.
+
+    It does not where teeth meet.
+    """
+    same = problem.terms.structural or cheap == problem.episodes[0].replay.numerics
+    return problem if same else corrected(problem, cheap, values)
+
+
 def deferred_fit(
     problem: ReplayProblem,
     cheap: Numerics,

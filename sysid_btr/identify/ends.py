@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Problem
+from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.estimators.base import ResidualProblem
+from sysid_btr.estimators.lsq import Pattern
 from sysid_btr.identify.intervals import NORMAL, Estimate, responses
 from sysid_btr.terms.base import Parameter
 
@@ -23,6 +24,8 @@ NEARLY = 0.9
 """Of the loss that a parabola promises at an end, what is taken for it: the end would move by five percent."""
 AMONG_OTHERS = 2.0
 """Ratio of a parameter's conditional to its marginal information from which both ways out are looked at."""
+HELD = 1 << 24
+"""Residuals that are held at once."""
 _ROUNDS = 12
 
 
@@ -36,6 +39,7 @@ class _Way:
     direction : (p,) change of all parameters, of this one by `side`.
     half : how far its interval goes.
     rise : loss that a parabola gains there.
+    rows : (r,) residuals that can change on it; None for all.
     """
 
     index: int
@@ -43,12 +47,13 @@ class _Way:
     direction: FloatArray
     half: float
     rise: float
+    rows: BoolArray | None
 
 
 def followed(
     parameters: Sequence[Parameter],
     found: Sequence[Estimate],
-    problem: Problem,
+    problem: ResidualProblem,
     values: FloatArray,
     jacobian: FloatArray,
 ) -> tuple[tuple[Estimate, ...], int]:
@@ -60,40 +65,52 @@ def followed(
     problem, values : whose loss is a sum of squares, and its optimum (p,).
     jacobian : (r, p) of the whitened residuals there.
     """
-    ways = _ways(found, jacobian)
+    ways = _ways(found, jacobian, Pattern.of(problem))
     if not ways:
         return tuple(found), 0
-    best = float(problem.loss(values[None])[0])
-    reach, spent = _reach(ways, problem, values, best)
+    reach, spent = _reach(ways, problem, values)
     result = list(found)
     for i in sorted({way.index for way in ways}):
         far = {s: max((r for w, r in zip(ways, reach, strict=True) if (w.index, w.side) == (i, s)), default=0.0)
                for s in (-1, 1)}  # fmt: skip
         result[i] = _moved(found[i], parameters[i].scale, far[-1], far[1])
-    return tuple(result), spent + 1
+    return tuple(result), spent
 
 
-def _ways(found: Sequence[Estimate], jacobian: FloatArray) -> list[_Way]:
+def _ways(found: Sequence[Estimate], jacobian: FloatArray, pattern: Pattern) -> list[_Way]:
     """The ways out of every interval that ends within its bounds."""
+    from scipy.sparse.csgraph import connected_components
+
     normal = jacobian.T @ jacobian
+    _, part = connected_components(normal != 0)
     ways = []
     for i, one in enumerate(found):
         if not normal[i, i] > 0:
             continue
-        along = responses(normal, i)
+        along = np.where(part == part[i], responses(normal, i), 0.0)
         rise = float(along @ normal @ along)
         alone = np.eye(len(found))[i]
         directions = [along] if rise <= 0 else [alone]
         if rise > 0 and normal[i, i] > AMONG_OTHERS * rise:
             directions.append(along)
+        rows = [_rows(pattern, d) for d in directions]
         for side, end, bound in ((-1, one.ci95[0], one.bounds[0]), (1, one.ci95[1], one.bounds[1])):
             if end != bound and end != one.value:
                 half = abs(end - one.value)
-                ways += [_Way(i, side, side * d, half, half**2 * rise) for d in directions]
+                ways += [
+                    _Way(i, side, side * d, half, half**2 * rise, own) for d, own in zip(directions, rows, strict=True)
+                ]
     return ways
 
 
-def _reach(ways: Sequence[_Way], problem: Problem, values: FloatArray, best: float) -> tuple[list[float], int]:
+def _rows(pattern: Pattern, direction: FloatArray) -> BoolArray | None:
+    """Residuals (r,) that a change (p,) of parameters can move; None for all."""
+    own = [pattern.support(int(j)) for j in np.flatnonzero(direction)]
+    known = [rows for rows in own if rows is not None]
+    return np.logical_or.reduce(known) if len(known) == len(own) else None
+
+
+def _reach(ways: Sequence[_Way], problem: ResidualProblem, values: FloatArray) -> tuple[list[float], int]:
     """How far each way goes until the loss has risen as far as it should, infinite where it does not; candidates."""
     most = [
         (problem.upper[w.index] - values[w.index]) if w.side > 0 else (values[w.index] - problem.lower[w.index])
@@ -101,16 +118,16 @@ def _reach(ways: Sequence[_Way], problem: Problem, values: FloatArray, best: flo
     ]
     far = [min(w.half, float(m)) for w, m in zip(ways, most, strict=True)]
     reach, inner = [0.0] * len(ways), [(0.0, 0.0)] * len(ways)
-    going, spent = list(range(len(ways))), 0
+    going, spent = list(range(len(ways))), 1
+    best = problem.residuals(values[None])[0] ** 2
     for _ in range(_ROUNDS):
         if not going:
             break
-        points = np.array([np.clip(values + far[k] * ways[k].direction, problem.lower, problem.upper) for k in going])
-        loss = problem.loss(points)
-        spent += len(points)
+        rises, taken = _rises(problem, values, best, [(ways[k], far[k]) for k in going])
+        spent += taken
         still = []
-        for k, value in zip(going, loss, strict=True):
-            rise, way = float(value) - best, ways[k]
+        for k, rise in zip(going, rises, strict=True):
+            way = ways[k]
             if not np.isfinite(rise) or rise >= NEARLY * way.rise:
                 reach[k] = _crossing(inner[k], (far[k], rise), way.rise)
             elif far[k] >= most[k]:
@@ -123,6 +140,40 @@ def _reach(ways: Sequence[_Way], problem: Problem, values: FloatArray, best: flo
     for k in going:
         reach[k] = inner[k][0]
     return reach, spent
+
+
+def _rises(
+    problem: ResidualProblem, values: FloatArray, best: FloatArray, steps: Sequence[tuple[_Way, float]]
+) -> tuple[list[float], int]:
+    """Rise of the loss above its squares `best` (r,) so far along each way, and the candidates simulated.
+
+    Ways that move different residuals share a candidate, unless it fails.
+    """
+    shared: list[tuple[list[int], BoolArray | None]] = []
+    for k, (way, _) in enumerate(steps):
+        for at, (party, rows) in enumerate(shared):
+            if rows is not None and way.rows is not None and not np.any(rows & way.rows):
+                shared[at] = [*party, k], rows | way.rows
+                break
+        else:
+            shared.append(([k], way.rows))
+    points = np.tile(values, (len(shared), 1))
+    for point, (party, _) in zip(points, shared, strict=True):
+        for k in party:
+            point += steps[k][1] * steps[k][0].direction
+    points, rises = np.clip(points, problem.lower, problem.upper), [np.nan] * len(steps)
+    size = max(HELD // len(best), 2)
+    for first in range(0, len(points), size):
+        block = problem.residuals(points[first : first + size])
+        for squares, (party, _) in zip(block**2 - best, shared[first : first + size], strict=True):
+            for k in party:
+                rows = steps[k][0].rows
+                rises[k] = float(np.sum(squares if rows is None else squares[rows]))
+    spent = len(points)
+    for k in (k for party, _ in shared if len(party) > 1 for k in party if not np.isfinite(rises[k])):
+        (rises[k],), _ = _rises(problem, values, best, [steps[k]])
+        spent += 1
+    return rises, spent
 
 
 def _crossing(near: tuple[float, float], far: tuple[float, float], goal: float) -> float:

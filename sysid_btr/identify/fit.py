@@ -17,7 +17,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.bounds import grow_bounds
 from sysid_btr.identify.coarse import realise_servo, weigh_columns
-from sysid_btr.identify.deferred import corrected, deferred_fit
+from sysid_btr.identify.deferred import cheaper, deferred_fit
 from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fixing import fix_unidentifiable
@@ -208,9 +208,7 @@ def fit(
     if solved.by_residuals:
         with phase("intervals", 0.7):
             if known is None and solved.result.termination is not Termination.BUDGET_SPENT:
-                # how fast the loss rises hardly depends on the integrator, but where teeth meet
-                same = terms.structural or study.cheap == study.numerics
-                near = problem if same else corrected(problem, study.cheap, values)
+                near = cheaper(problem, study.cheap, values)
                 found, spent = followed(problem.parameters, found, near, values, jacobian)
                 replays += spent
             values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))

@@ -129,7 +129,6 @@ def refit(
             problem,
             study.cheap,
             estimator,
-            step=step if polish else None,
             rng=rng,
             budget=budget,
             journal=journal,
