@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.simulation.joint_torques import own_torques, without_own
 from sysid_btr.simulation.kinematics import Kinematics
 from sysid_btr.simulation.mujoco_batch import VELOCITY, evaluate
 from sysid_btr.simulation.replay import Replay
@@ -26,16 +27,14 @@ from sysid_btr.terms.base import BatchModel, Outputs, Term
 if TYPE_CHECKING:
     import mujoco
 
-JOINT = 1
-"""Kind of a tendon's part (mjtWrap)."""
-NOT_RIGID = ("dof_frictionloss", "dof_armature", "dof_damping", "tendon_frictionloss", "actuator_")
+NOT_RIGID = ("dof_frictionloss", "tendon_frictionloss", *(f"actuator_{n}" for n in ("gain", "bias", "dyn", "force")))
 """Beginnings of fields that the torque of the rigid bodies does not depend on."""
 ROUNDS = 8
 """In which friction that follows the servo's torque is found: a ratio of 0.5 is within 0.4 % then."""
 
 
 class Rigid(NamedTuple):
-    """Torques (n, j) of the rigid bodies and their springs, and those of weight and motion alone."""
+    """Torques (n, j) of the rigid bodies and of what is between them, and those of weight and motion alone."""
 
     torque: FloatArray
     load: FloatArray
@@ -68,21 +67,18 @@ class InverseReplay(Replay):
         batch = self.batch(pairs, m)
         shape = (m, *motion.position.shape)
         effort = np.empty(shape)
-        fields = ("dof_armature", "dof_damping", "dof_frictionloss")
-        # inertia of rotors, damping and friction of joints, which many candidates differ in, are added apart
-        armature, damping, friction = (batch.read(name)[:, self.index.dof] for name in fields)
-        shared, applied = self._tendon_friction(batch), self._applied(batch, pairs)
+        friction, applied = batch.read("dof_frictionloss")[:, self.index.dof], self._applied(batch, pairs)
         laws = tuple(law for law in laws_of(self.index, pairs) if not needs_history(type(law.term)))
         acting = _acting(laws, motion, m)
-        for i, (rigid, act) in enumerate(zip(self._rigid(batch), acting, strict=True)):
-            rotors = armature[i] * motion.acceleration
-            smooth = rigid.torque + rotors + damping[i] * motion.velocity + shared[min(i, len(shared) - 1)]
+        parts = zip(self._rigid(without_own(batch)), own_torques(batch, motion), acting, strict=True)
+        for i, (rigid, own, act) in enumerate(parts):
+            smooth = rigid.torque + own.rotors + own.others
             effort[i] = smooth + friction[i] * motion.direction
             if act is None:
                 continue
             for _ in range(ROUNDS):
                 # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
-                rubbed, pushed = act(effort[i], rigid.load + rotors)
+                rubbed, pushed = act(effort[i], rigid.load + own.rotors)
                 found = smooth + np.maximum(friction[i] + rubbed, 0.0) * motion.direction - pushed
                 settled = np.array_equal(found, effort[i])
                 effort[i] = found
@@ -108,7 +104,7 @@ class InverseReplay(Replay):
         return sha256(content.tobytes()).digest()
 
     def _rigid(self, batch: BatchModel) -> Iterator[Rigid]:
-        """What masses, gravity, springs and tendons take in each candidate, without rotors and dampers.
+        """What bodies take in each candidate, and what is between them that is no joint's own.
 
         Candidates that differ in nothing of that share one computation, and the last ones are remembered.
         """
@@ -119,9 +115,7 @@ class InverseReplay(Replay):
 
     def _of_one(self, batch: BatchModel, candidate: int) -> Rigid:
         motion, dof = self.motion, self.index.dof
-        alone = batch.candidate(candidate)
-        alone.dof_armature[:], alone.dof_damping[:] = 0.0, 0.0
-        own = BatchModel(alone, batch.index, batch.timestep, len(motion.time))
+        own = BatchModel(batch.candidate(candidate), batch.index, batch.timestep, len(motion.time))
         qpos = np.tile(own.model.qpos0, (own.size, 1))
         qvel, acceleration = np.zeros((own.size, own.model.nv)), np.zeros((own.size, own.model.nv))
         qpos[:, self.index.qpos], qvel[:, dof] = motion.position, motion.velocity
@@ -130,16 +124,6 @@ class InverseReplay(Replay):
         seen = evaluate(own, {"qpos": qpos, "qvel": qvel}, names, stage=VELOCITY, threads=self.threads)
         weight = _times(own.model, seen["M"], acceleration) + seen["qfrc_bias"]
         return Rigid((weight - seen["qfrc_passive"])[:, dof], weight[:, dof])
-
-    def _tendon_friction(self, batch: BatchModel) -> FloatArray:
-        """Torques (m, n, j) by dry friction of tendons that are sums of joints."""
-        model, motion = batch.model, self.motion
-        total = np.zeros((1, 1, 1))
-        friction = batch.read("tendon_frictionloss")
-        for t in np.flatnonzero(friction.any(axis=0)):
-            lever = fixed_tendon(model, int(t))[self.index.dof]
-            total = total + friction[:, t, None, None] * motion.direction_along(lever[None]) * lever
-        return total
 
     def _applied(self, batch: BatchModel, pairs: Values) -> FloatArray:
         """Torques (m, n, j) known in advance."""
@@ -180,16 +164,6 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[
 def needs_history(term: type[Term]) -> bool:
     """Whether a kind of term acts by what was before, or through a joint of its own, and so not on single samples."""
     return term.law_memory > 0 or term.structural
-
-
-def fixed_tendon(model: mujoco.MjModel, tendon: int) -> FloatArray:
-    """(nv,) length of a tendon per motion of each joint; zero where it is no sum of joints."""
-    first = int(model.tendon_adr[tendon])
-    rows = slice(first, first + int(model.tendon_num[tendon]))
-    lever = np.zeros(model.nv)
-    joint = model.wrap_type[rows] == JOINT
-    lever[model.jnt_dofadr[model.wrap_objid[rows][joint]]] = model.wrap_prm[rows][joint]
-    return lever
 
 
 def _times(model: mujoco.MjModel, inertia: FloatArray, acceleration: FloatArray) -> FloatArray:
