@@ -155,6 +155,22 @@ def test_bodies_that_hang_together_otherwise_are_computed_anew(replay_of: Callab
     assert_alike(replay, changes)
 
 
+def test_candidates_with_other_masses_ask_mujoco_of_one_model(
+    replay_of: Callable[[str], Changed], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replay, calls = replay_of(PLAIN), []
+    original = InverseReplay._of_one
+    replay = replace(replay, kinematics=noise(len(replay.index.joints)))
+    monkeypatch.setattr(InverseReplay, "_of_one", lambda self, model: calls.append(1) or original(self, model))
+    rng = np.random.default_rng(2)
+    asked(replay, changed(replay, rng, SPRINGS, size=8))
+    first = len(calls)
+    asked(replay, changed(replay, rng, (*SPRINGS, "tendon_armature", "tendon_damping"), size=8))
+    # the model itself, and the probes of four bodies of which one is simple
+    assert first <= 1 + 3 * 11 + 5
+    assert len(calls) == first
+
+
 def test_a_candidate_does_not_depend_on_those_beside_it(replay_of: Callable[[str], Changed]) -> None:
     replay = replay_of(PLAIN)
     changes = changed(replay, np.random.default_rng(3), (*SPRINGS, *TENDONS), size=5)

@@ -9,7 +9,7 @@ these move nothing here.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, NamedTuple
@@ -20,15 +20,18 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.simulation.joint_torques import own_torques, without_own
 from sysid_btr.simulation.kinematics import Kinematics
 from sysid_btr.simulation.mujoco_batch import VELOCITY, evaluate
+from sysid_btr.simulation.regressor import INERTIAL, Regressor, inertial_changes
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import Law, Values, laws_of, write_terms
-from sysid_btr.terms.base import BatchModel, Outputs, Term
+from sysid_btr.terms.base import BatchModel, Fields, Outputs, Term
 
 if TYPE_CHECKING:
     import mujoco
 
 NOT_RIGID = ("dof_frictionloss", "tendon_frictionloss", *(f"actuator_{n}" for n in ("gain", "bias", "dyn", "force")))
 """Beginnings of fields that the torque of the rigid bodies does not depend on."""
+BETWEEN = ("dof_", "jnt_stiffness", "qpos_spring", "tendon_")
+"""Beginnings of fields that it depends on, and that part of it which masses make does not."""
 ROUNDS = 8
 """In which friction that follows the servo's torque is found: a ratio of 0.5 is within 0.4 % then."""
 
@@ -103,26 +106,69 @@ class InverseReplay(Replay):
         mujoco.mj_saveModel(self.model, None, content)
         return sha256(content.tobytes()).digest()
 
+    @cached_property
+    def _bodies(self) -> bytes:
+        """Digest of what the model has of bodies and joints, and of what pulls at them."""
+        model, option = self.model, self.model.opt
+        names = [name for name in dir(model) if name.startswith(("body_", "jnt_", "dof_")) or name == "qpos0"]
+        values = [self.index.dof, option.gravity, option.disableflags, *(getattr(model, name) for name in names)]
+        return sha256(b"".join(np.asarray(x).tobytes() for x in values)).digest()
+
+    @cached_property
+    def _linear(self) -> bool:
+        """Whether masses act by inertia and weight alone: compensation of gravity and fluids follow them too."""
+        model = self.model
+        return not (model.body_gravcomp.any() or model.opt.density or model.opt.viscosity)
+
     def _rigid(self, batch: BatchModel) -> Iterator[Rigid]:
         """What bodies take in each candidate, and what is between them that is no joint's own.
 
-        Candidates that differ in nothing of that share one computation, and the last ones are remembered.
+        Candidates that differ in nothing of that share one computation, and the last ones are remembered. Those whose
+        bodies hang together as the model's do are that model, and what the regressor says of their masses.
         """
+        fields = {name: values for name, values in batch.fields.items() if not name.startswith(NOT_RIGID)}
+        massless = {name: values for name, values in fields.items() if name not in INERTIAL}
+        alike = np.full(batch.size, self._linear)
+        for name, values in massless.items():
+            if not name.startswith(BETWEEN):
+                alike &= (values == batch.compiled(name)).reshape(batch.size, -1).all(axis=1)
+        changes = inertial_changes(batch)
         for i in range(batch.size):
-            fields = {n: v[i].tobytes() for n, v in batch.fields.items() if not n.startswith(NOT_RIGID)}
-            key = (self._digest, *(part for name in sorted(fields) for part in (name.encode(), fields[name])))
-            yield self.motion.remember(key, partial(self._of_one, batch, i))
+            rigid = self._remembered(replace(batch, fields=massless if alike[i] else fields), i)
+            if alike[i] and changes[i].any():
+                work = partial(self._regressor.torque, changes[i])
+                moved = self.motion.remember((self._bodies, changes[i].tobytes()), work)
+                rigid = Rigid(rigid.torque + moved, rigid.load + moved)
+            yield rigid
 
-    def _of_one(self, batch: BatchModel, candidate: int) -> Rigid:
+    def _remembered(self, batch: BatchModel, candidate: int) -> Rigid:
+        own = tuple((name, batch.fields[name][candidate].tobytes()) for name in sorted(batch.fields))
+        return self.motion.remember((self._digest, own), lambda: self._of_one(batch.candidate(candidate)))
+
+    @property
+    def _regressor(self) -> Regressor:
+        """Of the motion; models whose bodies are the same have it in common."""
+        make = partial(Regressor, self.model, self.index.body, len(self.motion.time), self._loads)
+        return self.motion.remember(("regressor", self._bodies), make)
+
+    def _loads(self, inertial: Fields) -> FloatArray:
+        """Torques (m, n, j) of weight and motion of the model with other inertial fields (m, ...)."""
+        size = len(inertial["body_mass"])
+        batch = without_own(BatchModel(self.model, self.index, self.motion.period, size, inertial))
+        # some rotor inertia, the same in all: an inertia matrix is to be inverted whatever the bodies are
+        batch.write({"dof_armature": np.ones(self.model.nv)})
+        return np.stack([self._of_one(batch.candidate(i)).load for i in range(batch.size)])
+
+    def _of_one(self, model: mujoco.MjModel) -> Rigid:
         motion, dof = self.motion, self.index.dof
-        own = BatchModel(batch.candidate(candidate), batch.index, batch.timestep, len(motion.time))
-        qpos = np.tile(own.model.qpos0, (own.size, 1))
-        qvel, acceleration = np.zeros((own.size, own.model.nv)), np.zeros((own.size, own.model.nv))
+        own = BatchModel(model, self.index, motion.period, len(motion.time))
+        qpos = np.tile(model.qpos0, (own.size, 1))
+        qvel, acceleration = np.zeros((own.size, model.nv)), np.zeros((own.size, model.nv))
         qpos[:, self.index.qpos], qvel[:, dof] = motion.position, motion.velocity
         acceleration[:, dof] = motion.acceleration
         names = ("M", "qfrc_bias", "qfrc_passive")
         seen = evaluate(own, {"qpos": qpos, "qvel": qvel}, names, stage=VELOCITY, threads=self.threads)
-        weight = _times(own.model, seen["M"], acceleration) + seen["qfrc_bias"]
+        weight = _times(model, seen["M"], acceleration) + seen["qfrc_bias"]
         return Rigid((weight - seen["qfrc_passive"])[:, dof], weight[:, dof])
 
     def _applied(self, batch: BatchModel, pairs: Values) -> FloatArray:
