@@ -77,16 +77,8 @@ class InverseReplay(Replay):
         for i, (rigid, own, act) in enumerate(parts):
             smooth = rigid.torque + own.rotors + own.others
             effort[i] = smooth + friction[i] * motion.direction
-            if act is None:
-                continue
-            for _ in range(ROUNDS):
-                # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
-                rubbed, pushed = act(effort[i], rigid.load + own.rotors)
-                found = smooth + np.maximum(friction[i] + rubbed, 0.0) * motion.direction - pushed
-                settled = np.array_equal(found, effort[i])
-                effort[i] = found
-                if settled:
-                    break
+            if act is not None:
+                act(friction[i], smooth, rigid.load + own.rotors, effort[i])
         outputs = Outputs(
             motion.time,
             np.array(np.broadcast_to(motion.position, shape)),
@@ -183,8 +175,8 @@ class InverseReplay(Replay):
         return applied
 
 
-Acting = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Torques of the drives and loads, (n, j) each -> friction and torques at the joints that laws add."""
+Acting = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], None]
+"""Takes friction (j,) without laws, torques (n, j) without any and those of the load; changes those of the drives."""
 
 
 def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[Acting | None]:
@@ -193,16 +185,15 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[
         return [None] * candidates
     # imports what compiles laws, which takes a second
     from sysid_btr.simulation.laws import table_of
-    from sysid_btr.simulation.stepping import on_samples
+    from sysid_btr.simulation.stepping import Samples, on_samples
 
     table, numbers, awake = table_of(laws, candidates)
     position, velocity = (np.ascontiguousarray(x) for x in (motion.position, motion.velocity))
 
-    def act(candidate: int, torque: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray]:
-        friction, pushed = np.zeros(position.shape), np.zeros(position.shape)
-        own = numbers[candidate], awake[candidate]
-        on_samples(table, *own, motion.period, position, velocity, torque, load, friction, pushed)
-        return friction, pushed
+    def act(candidate: int, dry: FloatArray, smooth: FloatArray, load: FloatArray, torque: FloatArray) -> None:
+        # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
+        samples = Samples(position, velocity, motion.direction, smooth, load)
+        on_samples(table, numbers[candidate], awake[candidate], motion.period, ROUNDS, samples, dry, torque)
 
     return [partial(act, i) if awake[i].any() else None for i in range(candidates)]
 
