@@ -9,7 +9,7 @@ these move nothing here.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,25 +17,27 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.simulation.joint_torques import own_torques, without_own
 from sysid_btr.simulation.kinematics import Kinematics
 from sysid_btr.simulation.mujoco_batch import VELOCITY, evaluate
+from sysid_btr.simulation.regressor import INERTIAL, Regressor, inertial_changes
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import Law, Values, laws_of, write_terms
-from sysid_btr.terms.base import BatchModel, Outputs, Term
+from sysid_btr.terms.base import BatchModel, Fields, Outputs, Term
 
 if TYPE_CHECKING:
     import mujoco
 
-JOINT = 1
-"""Kind of a tendon's part (mjtWrap)."""
-NOT_RIGID = ("dof_frictionloss", "dof_armature", "dof_damping", "tendon_frictionloss", "actuator_")
+NOT_RIGID = ("dof_frictionloss", "tendon_frictionloss", *(f"actuator_{n}" for n in ("gain", "bias", "dyn", "force")))
 """Beginnings of fields that the torque of the rigid bodies does not depend on."""
+BETWEEN = ("dof_", "jnt_stiffness", "qpos_spring", "tendon_")
+"""Beginnings of fields that it depends on, and that part of it which masses make does not."""
 ROUNDS = 8
 """In which friction that follows the servo's torque is found: a ratio of 0.5 is within 0.4 % then."""
 
 
 class Rigid(NamedTuple):
-    """Torques (n, j) of the rigid bodies and their springs, and those of weight and motion alone."""
+    """Torques (n, j) of the rigid bodies and of what is between them, and those of weight and motion alone."""
 
     torque: FloatArray
     load: FloatArray
@@ -68,26 +70,15 @@ class InverseReplay(Replay):
         batch = self.batch(pairs, m)
         shape = (m, *motion.position.shape)
         effort = np.empty(shape)
-        fields = ("dof_armature", "dof_damping", "dof_frictionloss")
-        # inertia of rotors, damping and friction of joints, which many candidates differ in, are added apart
-        armature, damping, friction = (batch.read(name)[:, self.index.dof] for name in fields)
-        shared, applied = self._tendon_friction(batch), self._applied(batch, pairs)
+        friction, applied = batch.read("dof_frictionloss")[:, self.index.dof], self._applied(batch, pairs)
         laws = tuple(law for law in laws_of(self.index, pairs) if not needs_history(type(law.term)))
         acting = _acting(laws, motion, m)
-        for i, (rigid, act) in enumerate(zip(self._rigid(batch), acting, strict=True)):
-            rotors = armature[i] * motion.acceleration
-            smooth = rigid.torque + rotors + damping[i] * motion.velocity + shared[min(i, len(shared) - 1)]
+        parts = zip(self._rigid(without_own(batch)), own_torques(batch, motion), acting, strict=True)
+        for i, (rigid, own, act) in enumerate(parts):
+            smooth = rigid.torque + own.rotors + own.others
             effort[i] = smooth + friction[i] * motion.direction
-            if act is None:
-                continue
-            for _ in range(ROUNDS):
-                # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
-                rubbed, pushed = act(effort[i], rigid.load + rotors)
-                found = smooth + np.maximum(friction[i] + rubbed, 0.0) * motion.direction - pushed
-                settled = np.array_equal(found, effort[i])
-                effort[i] = found
-                if settled:
-                    break
+            if act is not None:
+                act(friction[i], smooth, rigid.load + own.rotors, effort[i])
         outputs = Outputs(
             motion.time,
             np.array(np.broadcast_to(motion.position, shape)),
@@ -107,39 +98,70 @@ class InverseReplay(Replay):
         mujoco.mj_saveModel(self.model, None, content)
         return sha256(content.tobytes()).digest()
 
+    @cached_property
+    def _bodies(self) -> bytes:
+        """Digest of what the model has of bodies and joints, and of what pulls at them."""
+        model, option = self.model, self.model.opt
+        names = [name for name in dir(model) if name.startswith(("body_", "jnt_", "dof_")) or name == "qpos0"]
+        values = [self.index.dof, option.gravity, option.disableflags, *(getattr(model, name) for name in names)]
+        return sha256(b"".join(np.asarray(x).tobytes() for x in values)).digest()
+
+    @cached_property
+    def _linear(self) -> bool:
+        """Whether masses act by inertia and weight alone: compensation of gravity and fluids follow them too."""
+        model = self.model
+        return not (model.body_gravcomp.any() or model.opt.density or model.opt.viscosity)
+
     def _rigid(self, batch: BatchModel) -> Iterator[Rigid]:
-        """What masses, gravity, springs and tendons take in each candidate, without rotors and dampers.
+        """What bodies take in each candidate, and what is between them that is no joint's own.
 
-        Candidates that differ in nothing of that share one computation, and the last ones are remembered.
+        Candidates that differ in nothing of that share one computation, and the last ones are remembered. Those whose
+        bodies hang together as the model's do are that model, and what the regressor says of their masses.
         """
+        fields = {name: values for name, values in batch.fields.items() if not name.startswith(NOT_RIGID)}
+        massless = {name: values for name, values in fields.items() if name not in INERTIAL}
+        alike = np.full(batch.size, self._linear)
+        for name, values in massless.items():
+            if not name.startswith(BETWEEN):
+                alike &= (values == batch.compiled(name)).reshape(batch.size, -1).all(axis=1)
+        changes = inertial_changes(batch)
         for i in range(batch.size):
-            fields = {n: v[i].tobytes() for n, v in batch.fields.items() if not n.startswith(NOT_RIGID)}
-            key = (self._digest, *(part for name in sorted(fields) for part in (name.encode(), fields[name])))
-            yield self.motion.remember(key, partial(self._of_one, batch, i))
+            rigid = self._remembered(replace(batch, fields=massless if alike[i] else fields), i)
+            if alike[i] and changes[i].any():
+                work = partial(self._regressor.torque, changes[i])
+                moved = self.motion.remember((self._bodies, changes[i].tobytes()), work)
+                rigid = Rigid(rigid.torque + moved, rigid.load + moved)
+            yield rigid
 
-    def _of_one(self, batch: BatchModel, candidate: int) -> Rigid:
+    def _remembered(self, batch: BatchModel, candidate: int) -> Rigid:
+        own = tuple((name, batch.fields[name][candidate].tobytes()) for name in sorted(batch.fields))
+        return self.motion.remember((self._digest, own), lambda: self._of_one(batch.candidate(candidate)))
+
+    @property
+    def _regressor(self) -> Regressor:
+        """Of the motion; models whose bodies are the same have it in common."""
+        make = partial(Regressor, self.model, self.index.body, len(self.motion.time), self._loads)
+        return self.motion.remember(("regressor", self._bodies), make)
+
+    def _loads(self, inertial: Fields) -> FloatArray:
+        """Torques (m, n, j) of weight and motion of the model with other inertial fields (m, ...)."""
+        size = len(inertial["body_mass"])
+        batch = without_own(BatchModel(self.model, self.index, self.motion.period, size, inertial))
+        # some rotor inertia, the same in all: an inertia matrix is to be inverted whatever the bodies are
+        batch.write({"dof_armature": np.ones(self.model.nv)})
+        return np.stack([self._of_one(batch.candidate(i)).load for i in range(batch.size)])
+
+    def _of_one(self, model: mujoco.MjModel) -> Rigid:
         motion, dof = self.motion, self.index.dof
-        alone = batch.candidate(candidate)
-        alone.dof_armature[:], alone.dof_damping[:] = 0.0, 0.0
-        own = BatchModel(alone, batch.index, batch.timestep, len(motion.time))
-        qpos = np.tile(own.model.qpos0, (own.size, 1))
-        qvel, acceleration = np.zeros((own.size, own.model.nv)), np.zeros((own.size, own.model.nv))
+        own = BatchModel(model, self.index, motion.period, len(motion.time))
+        qpos = np.tile(model.qpos0, (own.size, 1))
+        qvel, acceleration = np.zeros((own.size, model.nv)), np.zeros((own.size, model.nv))
         qpos[:, self.index.qpos], qvel[:, dof] = motion.position, motion.velocity
         acceleration[:, dof] = motion.acceleration
         names = ("M", "qfrc_bias", "qfrc_passive")
         seen = evaluate(own, {"qpos": qpos, "qvel": qvel}, names, stage=VELOCITY, threads=self.threads)
-        weight = _times(own.model, seen["M"], acceleration) + seen["qfrc_bias"]
+        weight = _times(model, seen["M"], acceleration) + seen["qfrc_bias"]
         return Rigid((weight - seen["qfrc_passive"])[:, dof], weight[:, dof])
-
-    def _tendon_friction(self, batch: BatchModel) -> FloatArray:
-        """Torques (m, n, j) by dry friction of tendons that are sums of joints."""
-        model, motion = batch.model, self.motion
-        total = np.zeros((1, 1, 1))
-        friction = batch.read("tendon_frictionloss")
-        for t in np.flatnonzero(friction.any(axis=0)):
-            lever = fixed_tendon(model, int(t))[self.index.dof]
-            total = total + friction[:, t, None, None] * motion.direction_along(lever[None]) * lever
-        return total
 
     def _applied(self, batch: BatchModel, pairs: Values) -> FloatArray:
         """Torques (m, n, j) known in advance."""
@@ -153,8 +175,8 @@ class InverseReplay(Replay):
         return applied
 
 
-Acting = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Torques of the drives and loads, (n, j) each -> friction and torques at the joints that laws add."""
+Acting = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], None]
+"""Takes friction (j,) without laws, torques (n, j) without any and those of the load; changes those of the drives."""
 
 
 def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[Acting | None]:
@@ -163,16 +185,15 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[
         return [None] * candidates
     # imports what compiles laws, which takes a second
     from sysid_btr.simulation.laws import table_of
-    from sysid_btr.simulation.stepping import on_samples
+    from sysid_btr.simulation.stepping import Samples, on_samples
 
     table, numbers, awake = table_of(laws, candidates)
     position, velocity = (np.ascontiguousarray(x) for x in (motion.position, motion.velocity))
 
-    def act(candidate: int, torque: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray]:
-        friction, pushed = np.zeros(position.shape), np.zeros(position.shape)
-        own = numbers[candidate], awake[candidate]
-        on_samples(table, *own, motion.period, position, velocity, torque, load, friction, pushed)
-        return friction, pushed
+    def act(candidate: int, dry: FloatArray, smooth: FloatArray, load: FloatArray, torque: FloatArray) -> None:
+        # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
+        samples = Samples(position, velocity, motion.direction, smooth, load)
+        on_samples(table, numbers[candidate], awake[candidate], motion.period, ROUNDS, samples, dry, torque)
 
     return [partial(act, i) if awake[i].any() else None for i in range(candidates)]
 
@@ -180,16 +201,6 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[
 def needs_history(term: type[Term]) -> bool:
     """Whether a kind of term acts by what was before, or through a joint of its own, and so not on single samples."""
     return term.law_memory > 0 or term.structural
-
-
-def fixed_tendon(model: mujoco.MjModel, tendon: int) -> FloatArray:
-    """(nv,) length of a tendon per motion of each joint; zero where it is no sum of joints."""
-    first = int(model.tendon_adr[tendon])
-    rows = slice(first, first + int(model.tendon_num[tendon]))
-    lever = np.zeros(model.nv)
-    joint = model.wrap_type[rows] == JOINT
-    lever[model.jnt_dofadr[model.wrap_objid[rows][joint]]] = model.wrap_prm[rows][joint]
-    return lever
 
 
 def _times(model: mujoco.MjModel, inertia: FloatArray, acceleration: FloatArray) -> FloatArray:

@@ -37,7 +37,7 @@ SLIDING = 0.02
 (pre-sliding: Armstrong-Helouvry, Dupont, Canudas de Wit 1994, doi:10.1016/0005-1098(94)90209-7), so that slow samples
 are left out of identifications. A hundredth more or less changes no estimate beyond its error."""
 REMEMBERED = 32
-"""Results that are kept with a motion: a fraction of a megabyte each."""
+"""Results that are kept with a motion: a fraction of a megabyte each, and a few for each body of a regressor."""
 FEWEST = 64
 """Samples from which a band can be read."""
 

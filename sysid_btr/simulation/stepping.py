@@ -429,28 +429,53 @@ def _roll(first: int, last: int, plan: Plan, own: Candidates, thread: Thread, ke
 roll = compiled(_roll)
 
 
+class Samples(NamedTuple):
+    """Samples (n, j) of a motion, and what it takes.
+
+    Attributes
+    ----------
+    position, velocity, direction : the last as dry friction has it.
+    smooth, load : torques without dry friction and laws, and those that load the joints.
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    direction: FloatArray
+    smooth: FloatArray
+    load: FloatArray
+
+
 def _on_samples(
     laws: Laws,
     numbers: FloatArray,
     awake: BoolArray,
     period: float,
-    position: FloatArray,
-    velocity: FloatArray,
+    rounds: int,
+    samples: Samples,
+    dry: FloatArray,
     torque: FloatArray,
-    load: FloatArray,
-    friction: FloatArray,
-    joint_torque: FloatArray,
 ) -> None:
-    """Let laws without memory act on samples (n, j) of a motion, and add what they do to the last two."""
-    rows, memory = np.zeros((ROWS, position.shape[1])), np.zeros(0)
+    """Find the torques (n, j) of drives under laws without memory, which may follow them, from those that are there.
+
+    `dry` is the friction (j,) that there is without laws.
+    """
+    rows, memory = np.zeros((ROWS, len(dry))), np.zeros(0)
     rows[VOLTAGE], rows[ENABLED] = np.nan, 1.0
-    for i in range(len(position)):
-        rows[COMMAND], rows[QPOS], rows[QVEL] = position[i], position[i], velocity[i]
-        rows[TORQUE], rows[LOAD] = torque[i], load[i]
-        rows[GAIN], rows[MOTOR], rows[LOW], rows[HIGH] = 1.0, 0.0, -np.inf, np.inf
-        rows[JOINT], rows[FRICTION] = joint_torque[i], friction[i]
-        apply_laws(laws, numbers, awake, memory, 0.0, period, rows)
-        joint_torque[i], friction[i] = rows[JOINT], rows[FRICTION]
+    for i in range(len(torque)):
+        rows[COMMAND], rows[QPOS], rows[QVEL] = samples.position[i], samples.position[i], samples.velocity[i]
+        rows[LOAD] = samples.load[i]
+        for _ in range(rounds):
+            rows[TORQUE], rows[GAIN], rows[LOW], rows[HIGH] = torque[i], 1.0, -np.inf, np.inf
+            rows[MOTOR], rows[JOINT], rows[FRICTION] = 0.0, 0.0, 0.0
+            apply_laws(laws, numbers, awake, memory, 0.0, period, rows)
+            settled = True
+            for j in range(len(dry)):
+                rubbed = max(dry[j] + rows[FRICTION, j], 0.0) * samples.direction[i, j]
+                found = samples.smooth[i, j] + rubbed - rows[JOINT, j]
+                settled = settled and found == torque[i, j]
+                torque[i, j] = found
+            if settled:
+                break
 
 
 on_samples = compiled(_on_samples)

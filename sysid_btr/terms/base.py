@@ -132,13 +132,13 @@ class BatchModel:
         """A copy of a compiled field's present values (`opt.gravity` for one of the options), (candidates, ...)."""
         if name in self.fields:
             return self.fields[name].copy()
-        shared = self._compiled(name)
+        shared = self.compiled(name)
         return np.tile(shared, (self.size, *(1,) * shared.ndim))
 
     def write(self, fields: Fields) -> None:
         """Let fields have these values."""
         for name, values in fields.items():
-            shared = self._compiled(name)
+            shared = self.compiled(name)
             self.fields[name] = np.array(np.broadcast_to(values, (self.size, *shared.shape)), dtype=shared.dtype)
 
     def candidate(self, row: int) -> mujoco.MjModel:
@@ -162,7 +162,8 @@ class BatchModel:
 
         return not self.fields.keys().isdisjoint(mujoco.MjModel._setconst_inputs)
 
-    def _compiled(self, name: str) -> Any:
+    def compiled(self, name: str) -> Any:
+        """The compiled field itself, which all candidates have that do not change it."""
         return np.asarray(getattr(self.model.opt, name[4:]) if name.startswith("opt.") else getattr(self.model, name))
 
 
