@@ -30,6 +30,7 @@ from sysid_btr.diagnosis.trials import (
     is_superfluous,
 )
 from sysid_btr.estimators.base import Progress
+from sysid_btr.identify.recorder import as_recorded
 from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.progress import phase
 from sysid_btr.terms.free_form import FREE_FORMS
@@ -143,5 +144,10 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
         fitted = refit(study, rest.with_(hypothesis.term(study.scales), hypothesis.start))
     study = study.with_initial_states(fitted.model)
     study, fitted = robust_refit(study, fitted, 1)
+    # what an effect hid may show now: see `as_recorded`
+    recorded = as_recorded(study, fitted.model)
+    if recorded is not study:
+        spent += fitted.evaluations
+        study, fitted = robust_refit(recorded, refit(recorded, fitted.model), 1)
     state = replace(state, study=study, fitted=fitted, evidence=(*staying, evidence)).spent(spent + fitted.evaluations)
     return state.step(added=(str(hypothesis),))

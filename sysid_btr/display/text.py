@@ -100,7 +100,7 @@ def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]
     yield from (Text(words, style="dim") for words in episode_words(result))
     numerics, model = result["numerics"], result["model"]["name"]
     yield Text(
-        f"model {model}, {numerics['chosen']}; {result['replays']} replays in {result['wall_s']:.1f} s"
+        f"model {model}, {numerics['chosen']}{f' ({why})' if (why := numerics.get('why')) else ''}; {result['replays']} replays in {result['wall_s']:.1f} s"
         + (f"; seed {result['seed']}" if result.get("seed") is not None else ""),
         style="dim",
     )

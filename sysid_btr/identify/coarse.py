@@ -36,6 +36,9 @@ def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress
         if not study.procedure.weighs_segments:
             study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS, budget, progress)
         study = inflate(study, coarse, memory=True)
+    if not study.procedure.alternations:
+        # by errors of the size that the model leaves
+        study = study.with_initial_states(coarse.model)
     return study, coarse
 
 
@@ -51,8 +54,8 @@ def realise_servo(study: Study, model: Model) -> Study:
     if held is None:
         return study
     short = shorten(study, SERVO_SECONDS)
-    misfit, near = _nearby(replace(short, numerics=euler), euler, model)
-    other, _ = _nearby(replace(short, numerics=held), euler, near)
+    misfit, near = nearby(replace(short, numerics=euler), euler, model)
+    other, _ = nearby(replace(short, numerics=held), euler, near)
     if not other < misfit - SERVO_MARGIN:
         return study
     part = Beginning.of(log)
@@ -60,7 +63,7 @@ def realise_servo(study: Study, model: Model) -> Study:
     return replace(study, numerics=found)
 
 
-def _nearby(study: Study, cheap: Numerics, model: Model) -> tuple[float, Model]:
+def nearby(study: Study, cheap: Numerics, model: Model) -> tuple[float, Model]:
     """Mean log chi2 of fitted columns where a few steps from a model lead, by the derivatives of cheap numerics."""
     problem = study.train_problem(model)
     estimator = LeastSquares(confirm=False, max_iterations=4, tolerance=2e-4, least_gain=LEAST_GAIN)

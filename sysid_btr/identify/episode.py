@@ -19,6 +19,7 @@ from sysid_btr.errors import ModelError
 from sysid_btr.estimators.base import ResidualEstimator
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.numerics import choose_numerics
+from sysid_btr.identify.starting import wanted_start
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import assumed_floor, hides_motion
 from sysid_btr.io.split import holdout_split
@@ -29,6 +30,7 @@ from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import COMPARED, WARM_UP, Target, make_targets
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.replay import Replay
+from sysid_btr.simulation.start import Start
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.model import Terms
 
@@ -332,7 +334,14 @@ def _with_noise(target: Target, mount: str, inflation: Inflation) -> Target:
 
 @dataclass(frozen=True, eq=False)
 class FixedEpisode(Episode):
-    """One whose base is fixed: it is replayed whole, as one segment, from its first sample."""
+    """One whose base is fixed: it is replayed whole, as one segment, from its first sample.
+
+    Attributes
+    ----------
+    begun : state from which it is replayed, see `Replay`.
+    """
+
+    begun: Start | None = None
 
     warm_up: ClassVar[float] = WARM_UP
 
@@ -348,4 +357,11 @@ class FixedEpisode(Episode):
         return cls(robot, log, fitted), cls(robot, log, ~fitted)
 
     def replay(self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0) -> Replay:
-        return Replay(self.robot.for_log(self.log), self.log, tuple(terms), numerics, effort, threads)
+        robot = self.robot.for_log(self.log)
+        return Replay(robot, self.log, tuple(terms), numerics, effort, threads, begun=self.begun)
+
+    def with_initial_states(
+        self, compare: Callable[[], Comparison], values: FloatArray, coarse: Numerics, *, anew: bool = True
+    ) -> FixedEpisode:
+        # a model of which nothing was fitted yet would move it by its own errors
+        return replace(self, begun=wanted_start(compare(), values)) if len(values) else self

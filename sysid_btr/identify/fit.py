@@ -24,6 +24,7 @@ from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates
 from sysid_btr.identify.nuisance import assumptions, check_nuisance, error_of_the_rest
 from sysid_btr.identify.outcome import StudyOutcome
+from sysid_btr.identify.recorder import as_recorded
 from sysid_btr.identify.scores import Misfit, Scores, misfit_of, score
 from sysid_btr.identify.sensitivity import with_sensitivity
 from sysid_btr.identify.step_check import Optimum, with_short_steps
@@ -185,7 +186,7 @@ def fit(
     budget = budget or Budget()
     search = _Search(estimator, distance, rng, budget, Journal() if journal is None else journal, progress)
     with phase("search", 0.7):
-        solved = search.run(realise_servo(study, model), model)
+        solved = search.run(as_recorded(realise_servo(study, model), model), model)
     study, replays = solved.study, solved.replays
     at = Optimum.of(solved.problem, solved.result, study.stencil(terms))
     if solved.by_residuals:

@@ -126,13 +126,7 @@ def refit(
     cheaper = study.procedure.deferred or not (polish or costly)
     if cheaper and study.numerics != study.cheap:
         result = deferred_fit(
-            problem,
-            study.cheap,
-            estimator,
-            rng=rng,
-            budget=budget,
-            journal=journal,
-            progress=progress,
+            problem, study.cheap, estimator, rng=rng, budget=budget, journal=journal, progress=progress
         )
     else:
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)

@@ -7,7 +7,7 @@ states, commands and laws; they run in chunks, so that memory stays bounded what
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from sysid_btr.simulation.servo import ServoLaw
 from sysid_btr.simulation.setup import Setup, Values, prepare, write_terms
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.simulation.simulator import States
-from sysid_btr.simulation.start import coupled_state, initial_state
+from sysid_btr.simulation.start import Start, coupled_state, initial_state
 from sysid_btr.terms.base import BatchModel, JointAddresses, Outputs, Parameter, Term
 from sysid_btr.terms.drives import joint_drives
 from sysid_btr.terms.power import Switch
@@ -51,6 +51,7 @@ class Replay:
     robot, log, terms, numerics : what is replayed and how.
     effort : whether servo torques are predicted too.
     threads : worker threads, 0 for all cores.
+    begun : state from which it starts; None for that of the log's first samples.
     """
 
     robot: Robot
@@ -59,6 +60,7 @@ class Replay:
     numerics: Numerics
     effort: bool = False
     threads: int = 0
+    begun: Start | None = field(default=None, kw_only=True)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -101,7 +103,10 @@ class Replay:
     def start(self) -> tuple[FloatArray, FloatArray]:
         """Initial positions and velocities of the joints, (j,) each."""
         joints = self.index.joints
-        start = initial_state(self.log, joints, resting(self.robot, self.log, joints))
+        if self.begun is None:
+            start = initial_state(self.log, joints, resting(self.robot, self.log, joints))
+        else:
+            start = self.begun.position.copy(), self.begun.velocity.copy()
         unlogged = np.array([not self.log.has("position", joint) for joint in joints], dtype=bool)
         return coupled_state(self.model, self.index, *start, unlogged)
 

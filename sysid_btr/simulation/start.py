@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,14 @@ FIT_SAMPLES = 7
 
 ROUNDS, CLOSED = 30, 1e-10
 """Iterations that close loops of joints, and the error in m or rad at which they are closed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A state of the joints of a log, (j,) each."""
+
+    position: FloatArray
+    velocity: FloatArray
 
 
 def initial_state(log: Log, joints: tuple[str, ...], defaults: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -44,6 +53,23 @@ def initial_state(log: Log, joints: tuple[str, ...], defaults: FloatArray) -> tu
         if log.has("velocity", joint) and np.isfinite(log.channels[f"velocity.{joint}"][0]):
             qvel[i] = log.channels[f"velocity.{joint}"][0]
     return qpos, qvel
+
+
+def start_error(log: Log, joint: str, noise: float) -> tuple[float, float]:
+    """How far off a joint's initial state may be, by the noise of its position and by how much its motion bends.
+
+    Standard deviations of position and velocity; nothing is known of fewer than three samples.
+    """
+    values = log.channels[f"position.{joint}"][: 4 * FIT_SAMPLES]
+    good = np.flatnonzero(np.isfinite(values))[:FIT_SAMPLES]
+    if len(good) < 3:
+        return np.inf, np.inf
+    time = log.time[good] - log.time[0]
+    design = np.vander(time, 3, increasing=True)
+    inverse = np.linalg.pinv(design)
+    position, velocity, _ = noise * np.linalg.norm(inverse, axis=1)
+    bend, span = float(inverse[2] @ values[good]), float(time[-1])
+    return float(np.hypot(position, bend * span**2)), float(np.hypot(velocity, 2 * bend * span))
 
 
 def coupled_state(
