@@ -18,6 +18,7 @@ from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.horizon import CURVED, is_held
 from sysid_btr.identify.mode import Mode
+from sysid_btr.identify.refit import judge
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.segmented import SegmentedEpisode, follow, measured_motion
 from sysid_btr.identify.study import make_study
@@ -263,6 +264,17 @@ def test_the_right_model_leaves_noise_alone_however_long_a_robot_remembers_its_s
     scores = score(study, Model.of(()))
     for part in (scores.train, scores.holdout):
         assert part["position"].chi2 == pytest.approx(1.0, abs=0.15)
+
+
+def test_scores_do_not_depend_on_how_large_the_noise_is_taken_to_be() -> None:
+    """Starts that a wrong model moved away are taken back by what is known of them, not by less."""
+    damped = 'damping=".02"'
+    log = driven(torque=QUIET, dry=damped, upper=0.5)
+    plain = make_study(double_pendulum(damped), [log], numerics=Numerics("RK4", 0.005), threads=1)
+    doubtful = replace(plain, inflation={("fixed", "position", joint): 100.0 for joint in JOINTS})
+    model = Model.of(())
+    assert score(doubtful, model).train["position"].chi2 == score(plain, model).train["position"].chi2
+    assert judge(doubtful, model).train == judge(plain, model).train
 
 
 def test_the_torque_at_the_last_sample_of_a_segment_is_that_of_its_own_command() -> None:
