@@ -18,6 +18,7 @@ from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.horizon import CURVED, is_held
 from sysid_btr.identify.mode import Mode
+from sysid_btr.identify.refit import judge
 from sysid_btr.identify.scores import score
 from sysid_btr.identify.segmented import SegmentedEpisode, follow, measured_motion
 from sysid_btr.identify.study import make_study
@@ -49,14 +50,24 @@ def double_pendulum(dry: str = "", upper: float = 0.5) -> Robot:
     return robot_from_xml(TWO.format(dry=dry, upper=upper), "double")
 
 
+# as stiff as the step allows: MuJoCo's own friction creeps
+STIFF = 'solreffriction="0.001 1" solimpfriction="0.99 0.999 0.001 0.5 2"'
+DRY = f'frictionloss="{FRICTION}" {STIFF}'
+
+
 @cache
-def driven(seed: int = 0, *, torque: float = WILD, seconds: float = 4.0, jitter: float = 0.0) -> Log:
+def driven(
+    seed: int = 0,
+    *,
+    torque: float = WILD,
+    seconds: float = 4.0,
+    jitter: float = 0.0,
+    dry: str = DRY,
+    upper: float = MASS,
+) -> Log:
     """A log of the double pendulum with dry friction at both joints and a heavier link, by MuJoCo alone."""
     rng = np.random.default_rng(seed)
-    # as stiff as the step allows: MuJoCo's own friction creeps
-    stiff = 'solreffriction="0.001 1" solimpfriction="0.99 0.999 0.001 0.5 2"'
-    spec = TWO.format(dry=f'frictionloss="{FRICTION}" {stiff}', upper=MASS)
-    model = mujoco.MjModel.from_xml_string(spec)
+    model = mujoco.MjModel.from_xml_string(TWO.format(dry=dry, upper=upper))
     model.opt.timestep, model.opt.integrator = 0.0005, mujoco.mjtIntegrator.mjINT_RK4
     data = mujoco.MjData(model)
     ticks, n = 10, round(seconds / 0.005)
@@ -91,9 +102,7 @@ def test_torques_that_swing_a_double_pendulum_round_ask_for_segments() -> None:
     robot = double_pendulum()
     study = make_study(robot, [driven()], threads=1)
     assert all(isinstance(e, SegmentedEpisode) for e in (*study.train, *study.holdout))
-    followed = follow(robot, driven())
-    assert not followed.open_loop
-    assert 0.2 < followed.seconds < 4.0
+    assert 0.2 < follow(robot, driven()) < 4.0
     facts = study.train[0].facts()
     assert facts is not None
     assert facts["mode"] == "segments"
@@ -187,7 +196,7 @@ def test_what_is_missing_is_looked_for_before_masses_make_up_for_it() -> None:
 @pytest.mark.parametrize("torque", [QUIET, WILD])
 def test_a_model_that_lacks_something_is_followed_until_its_error_is_half_of_the_motion(torque: float) -> None:
     log = driven(torque=torque)
-    lacking, right = (follow(double_pendulum(dry), log).seconds for dry in ("", f'frictionloss="{FRICTION}"'))
+    lacking, right = (follow(double_pendulum(dry), log) for dry in ("", f'frictionloss="{FRICTION}"'))
     assert lacking <= right
     study = make_study(double_pendulum(), [log], numerics=Numerics("RK4", 0.005), threads=1)
     error = score(study, Model.of(())).train["position"].rmse
@@ -196,7 +205,7 @@ def test_a_model_that_lacks_something_is_followed_until_its_error_is_half_of_the
 
 def test_friction_shortens_segments_of_a_quiet_log() -> None:
     log = driven(torque=QUIET)
-    lacking, right = (follow(double_pendulum(dry), log).seconds for dry in ("", f'frictionloss="{FRICTION}"'))
+    lacking, right = (follow(double_pendulum(dry), log) for dry in ("", f'frictionloss="{FRICTION}"'))
     assert lacking < 0.7 * right
 
 
@@ -245,6 +254,40 @@ def test_segments_from_the_states_of_a_whole_replay_give_that_replay(jitter: flo
         np.testing.assert_allclose(segments.position[k, 120:399], whole.position[k, 120:399], atol=2e-4)
         alone = SegmentReplay(robot, log, (late,), numerics, segments=starts.chosen(np.array([1]))).predict(value[None])
         assert np.array_equal(alone.position[0, 220:321], segments.position[k, 220:321])
+
+
+def test_the_right_model_leaves_noise_alone_however_long_a_robot_remembers_its_start() -> None:
+    """Damped arms can be followed to the end of the log, and what is unknown of a start lasts for seconds."""
+    damped = 'damping=".02"'
+    log = driven(torque=QUIET, dry=damped, upper=0.5)
+    study = make_study(double_pendulum(damped), [log], numerics=Numerics("RK4", 0.005), threads=1)
+    scores = score(study, Model.of(()))
+    for part in (scores.train, scores.holdout):
+        assert part["position"].chi2 == pytest.approx(1.0, abs=0.15)
+
+
+def test_scores_do_not_depend_on_how_large_the_noise_is_taken_to_be() -> None:
+    """Starts that a wrong model moved away are taken back by what is known of them, not by less."""
+    damped = 'damping=".02"'
+    log = driven(torque=QUIET, dry=damped, upper=0.5)
+    plain = make_study(double_pendulum(damped), [log], numerics=Numerics("RK4", 0.005), threads=1)
+    doubtful = replace(plain, inflation={("fixed", "position", joint): 100.0 for joint in JOINTS})
+    model = Model.of(())
+    assert score(doubtful, model).train["position"].chi2 == score(plain, model).train["position"].chi2
+    assert judge(doubtful, model).train == judge(plain, model).train
+
+
+def test_the_torque_at_the_last_sample_of_a_segment_is_that_of_its_own_command() -> None:
+    robot, log = double_pendulum(), driven(seconds=1.0)
+    rows, still = np.array([[0, 90], [90, 150], [150, 200]]), np.zeros((3, 2))
+    segments = Segments(rows, still, still, np.ones((3, 4)))
+    seen = SegmentReplay(robot, log, (), Numerics("RK4", 0.005), effort=True, segments=segments).predict(
+        np.zeros((1, 0))
+    )
+    assert seen.effort is not None
+    wanted = np.column_stack([log.channels[f"command.{j}"] for j in JOINTS])
+    # what is commanded at the last sample of a log is not replayed
+    np.testing.assert_allclose(seen.effort[0, :-1], wanted[:-1], atol=1e-12)
 
 
 def test_segments_tile_what_is_fitted_and_what_is_held_out() -> None:

@@ -293,6 +293,21 @@ def test_dry_friction_stops_a_free_rotor_when_its_impulse_is_used_up() -> None:
     np.testing.assert_allclose(outputs.velocity[0, :, 0], wanted, atol=0.01)
 
 
+@pytest.mark.parametrize("speed", [2.0, 2.03, 2.07])
+def test_dry_friction_turns_round_with_the_joint(speed: float) -> None:
+    """Slower under friction and torque, then faster under their difference; a third of a step too early at most."""
+    friction, torque, step = 0.05, -0.1, 0.005
+    robot, log = loose(), make_log(np.arange(201) * 0.01, {})
+    terms = [*parse_parameters(["qvel0:arm"], robot), at_arm(CoulombFriction), at_arm(ConstantForce)]
+    outputs = run(robot, log, terms, [speed, friction, torque], Numerics("RK4", step))
+    slower, faster = (torque - friction) / TOTAL_INERTIA, (torque + friction) / TOTAL_INERTIA
+    left = np.arange(201) * 0.01 - speed / -slower
+    wanted = np.where(left < 0, slower, faster) * left
+    # what friction does otherwise until then: it has the other sign
+    early = 2 * friction / TOTAL_INERTIA * step / 3
+    np.testing.assert_allclose(outputs.velocity[0, left > 0.05, 0], wanted[left > 0.05], atol=early)
+
+
 def test_viscous_damping_decays_a_free_rotor_exponentially() -> None:
     robot, log = loose(), make_log(np.arange(201) * 0.01, {})
     start = parse_parameters(["qvel0:arm"], robot)

@@ -34,7 +34,7 @@ def measured_torques(robot: Robot, log: Log, threads: int = 0) -> Log | None:
     configured = robot.for_log(log)
 
     def better() -> bool:
-        seconds = follow(robot, log, threads).seconds
+        seconds = follow(robot, log, threads)
         given, asked = (_misfit(robot, one, seconds, threads) for one in (measured, log))
         return given < asked
 

@@ -36,10 +36,8 @@ def is_held(robot: Robot, log: Log) -> bool:
     return all(joint in servos for joint in joint_names(configured) if log.has("position", joint))
 
 
-def linear_seconds(
-    robot: Robot, log: Log, segments: Segments, threads: int = 0
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How long the replay of each segment by the plain model stays linear, and near the log, and how far it is off.
+def linear_seconds(robot: Robot, log: Log, segments: Segments, threads: int = 0) -> tuple[FloatArray, FloatArray]:
+    """How long the replay of each segment by the plain model stays linear, and near the log.
 
     Changes are one standard deviation of each number of the start, and one `scale` of each body's mass.
 
@@ -51,10 +49,8 @@ def linear_seconds(
 
     Returns
     -------
-    linear, near, misfit : (w,) each, s: until changes of start and masses, and until the error of the model itself, do
-        not act in proportion any more; all of a segment where they do to the end. The misfit is the root-mean-square
-        error as long as it is linear, over the standard deviation of what was measured: 1 is no better than to stand
-        still.
+    linear, near : (w,) each, s: until changes of start and masses, and until the error of the model itself, do not act
+        in proportion any more; all of a segment where they do to the end.
     """
     terms = Terms(parse_parameters(["mass:*"], robot))
     whole = SegmentReplay(robot.for_log(log), log, tuple(terms), largest_step(log), threads=threads, segments=segments)
@@ -65,7 +61,7 @@ def linear_seconds(
     nominal, step = terms.nominal, np.diag(terms.scale)
     candidates = np.concatenate([nominal[None], nominal + step, nominal - step])
     identity = np.eye(segments.std.shape[1])
-    linear, near, misfit = np.zeros((3, len(segments)))
+    linear, near = np.zeros((2, len(segments)))
     for w, (a, b) in enumerate(segments.rows):
         replay = replace(whole, segments=segments.chosen(np.array([w])))
         directions = segments.std[w] * np.concatenate([0 * identity[:1], identity, -identity])
@@ -76,11 +72,8 @@ def linear_seconds(
         end = min(_linear(x[:, :, joints] / sigma) for x in (by_mass, by_start))
         error = measured[a:b] - by_mass[0][:, joints]
         near[w] = time[_small(error / sigma, measured[a:b] / sigma) - 1]
-        error = error[:end]
-        moved = measured[a:b][:end] - np.nanmean(measured[a:b][:end], axis=0)
         linear[w] = time[end - 1]
-        misfit[w] = np.sqrt(np.nansum(error**2) / max(float(np.nansum(moved**2)), 1e-300))
-    return linear, near, misfit
+    return linear, near
 
 
 def _linear(white: FloatArray) -> int:

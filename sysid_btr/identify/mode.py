@@ -132,10 +132,7 @@ def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str
         return "inverse", "no command is logged"
     if is_held(robot, log):
         return "forward", ""
-    followed = follow(robot, log, threads)
-    if followed.open_loop:
-        return "forward", ""
-    return "segments", f"open loop, the plain model can be followed for {followed.seconds:.2g} s"
+    return "segments", f"open loop, the plain model can be followed for {follow(robot, log, threads):.2g} s"
 
 
 def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:

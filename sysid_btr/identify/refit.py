@@ -151,8 +151,10 @@ def best_start(study: Study, terms: Terms, starts: FloatArray) -> FloatArray:
 
 def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:
     """Scores of a model on fitted and held-out data."""
-    train = study.train_problem(model)
-    holdout = study.holdout_problem(model)
+    # uncertain starts explain the less, the larger the noise is taken to be
+    plain = replace(study, inflation={})
+    train = plain.train_problem(model)
+    holdout = plain.holdout_problem(model)
     r, s = of_both(train, holdout, lambda problem: np.asarray(problem.residuals(model.values[None])[0]))
     train_columns, holdout_columns = train.column_chi2(r), holdout.column_chi2(s)
     train_cells, train_counts = _by_cell(train, r)

@@ -97,7 +97,7 @@ class SegmentedEpisode(Episode):
             If no joint's position is logged.
         """
         tracks = measured_motion(robot, log)
-        length = follow(robot, log, threads).seconds if seconds is None else seconds
+        length = follow(robot, log, threads) if seconds is None else seconds
         every = np.ones(len(log), dtype=bool)
         return cls(robot, log, every, tracks, _cut(log, tracks, length, 0, len(log)), length)
 
@@ -114,7 +114,7 @@ class SegmentedEpisode(Episode):
         """
         count = len(holdout_split(log, holdout)[0])
         tracks, fitted = measured_motion(robot, log), np.arange(len(log)) < count
-        length = follow(robot, log, threads).seconds if seconds is None else seconds
+        length = follow(robot, log, threads) if seconds is None else seconds
         parts = ((fitted, 0, count), (~fitted, count, len(log)))
         first, last = (cls(robot, log, own, tracks, _cut(log, tracks, length, a, b), length) for own, a, b in parts)
         return first, last
@@ -217,35 +217,22 @@ class SegmentedEpisode(Episode):
         }
 
 
-@dataclass(frozen=True)
-class Followed:
-    """How long replays of a log by the plain model can be followed.
+def follow(robot: Robot, log: Log, threads: int = 0) -> float:
+    """For how long replays by the plain model can be followed, s.
 
-    Attributes
-    ----------
-    seconds : for how long half of the replays from different samples are well within what is linear, and near the log.
-    open_loop : whether the replay of all of it is linear to its end, and no worse than to stand still.
+    For so long half of those from different samples are well within what is linear, and near the log: `linear_seconds`.
     """
-
-    seconds: float
-    open_loop: bool
-
-
-def follow(robot: Robot, log: Log, threads: int = 0) -> Followed:
-    """How long replays of a log can be followed, see `linear_seconds`."""
     return log.once(("followed", robot.fingerprint, robot.at), lambda: _follow(robot, log, threads))
 
 
-def _follow(robot: Robot, log: Log, threads: int) -> Followed:
+def _follow(robot: Robot, log: Log, threads: int) -> float:
     tracks, n = measured_motion(robot, log), len(log)
     first = np.linspace(0, LATEST * n, STARTS).astype(np.int64)
-    linear, near, misfit = linear_seconds(
+    linear, near = linear_seconds(
         robot, log, _starts_at(tracks, np.stack([first, np.full(STARTS, n)], axis=1)), threads
     )
-    whole = linear[0] >= log.time[-1] - log.time[0]
-    seconds = float(np.median(np.minimum(KEPT * linear, near)))
     least = FEWEST * float(np.median(np.diff(log.time)))
-    return Followed(max(seconds, least), bool(whole and misfit[0] <= 1.0))
+    return max(float(np.median(np.minimum(KEPT * linear, near))), least)
 
 
 def measured_motion(robot: Robot, log: Log) -> Tracks:

@@ -70,12 +70,14 @@ class Comparison:
     def errors(self, outputs: Outputs) -> list[FloatArray]:
         """Errors in SI units of the first candidate, (n, k) for each target; NaN where a sample does not count.
 
-        An uncertain start is integrated out, so that they have the size of the noise where the model is right.
+        An uncertain start is integrated out, so that they have the size of the noise where the model is right; whatever
+        whitens residuals, by the noise: the larger that is taken to be, the less a start is taken to explain.
         """
-        white, result, first = self.whitened(outputs)[0], [], 0
-        for projection in self.projections:
+        plain = replace(self, targets=tuple(replace(t, sigma=t.noise) for t in self.targets))
+        white, result, first = plain.whitened(outputs)[0], [], 0
+        for projection in plain.projections:
             white[projection.columns] /= projection.weight  # every segment counts in full
-        for target in self.targets:
+        for target in plain.targets:
             error = np.full(target.mask.shape, np.nan)
             last = first + int(target.mask.sum())
             error[target.mask] = white[first:last]

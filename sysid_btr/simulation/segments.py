@@ -206,11 +206,8 @@ class _Frame:
     fraction: FloatArray
     late: float
     """s from the first border to the first sample."""
-
-    @cached_property
-    def steps(self) -> int:
-        """Steps to its last sample."""
-        return max(int(self.after[-1]), 1)
+    steps: int
+    """Steps to its last sample, and the one after it where torques are predicted."""
 
     @cached_property
     def size(self) -> int:
@@ -251,6 +248,8 @@ class SegmentReplay(Replay):
         frames = []
         for a, b in self._segments.rows:
             first = int(low[a])
+            # the torque at a sample is that of the step that begins there
+            end = int(low[b - 1]) + 1 if self.effort else int(high[b - 1])
             frames.append(
                 _Frame(
                     first,
@@ -258,6 +257,7 @@ class SegmentReplay(Replay):
                     high[a:b] - first,
                     grid.fraction[a:b],
                     float(grid.fraction[a] * grid.timestep),
+                    max(end - first, 1),
                 )
             )
         return frames
