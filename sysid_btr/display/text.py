@@ -99,11 +99,19 @@ def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]
         yield Text(f"could not be drawn: {missing}", style="bold")
     yield from (Text(words, style="dim") for words in episode_words(result))
     numerics, model = result["numerics"], result["model"]["name"]
+    if numerics.get("recorded"):
+        yield Text(RECORDED.format(numerics["chosen"]), style="dim")
     yield Text(
-        f"model {model}, {numerics['chosen']}{f' ({why})' if (why := numerics.get('why')) else ''}; {result['replays']} replays in {result['wall_s']:.1f} s"
+        f"model {model}, {numerics['chosen']}; {result['replays']} replays in {result['wall_s']:.1f} s"
         + (f"; seed {result['seed']}" if result.get("seed") is not None else ""),
         style="dim",
     )
+
+
+RECORDED = (
+    "the log moves as MuJoCo does in steps of {}, and not as in finer ones, so it is replayed in these "
+    "(others: --for INTEGRATOR:STEP)"
+)
 
 
 def certainty_words(effect: Mapping[str, Any]) -> str:

@@ -176,7 +176,7 @@ def _provenance(study: Study) -> dict[str, Any]:
             "chosen": str(study.numerics),
             **({} if simulator == MUJOCO else {"simulator": simulator}),
             **({"stated": True} if study.numerics.stated else {}),
-            **({"why": study.numerics_why} if study.numerics_why else {}),
+            **({"recorded": True} if study.numerics.recorded else {}),
         },
         "channels": study.channels,
         **({"walks": walks} if walks else {}),

@@ -55,7 +55,6 @@ class Study:
         column that the model cannot explain yet from distorting parameters about which others are informative. What is
         wrong about the ground is not an error of a robot that hangs.
     numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
-    numerics_why : why these numerics, where that is not what is usually done.
     independent : whether `inflation` lets each column count as its independent samples do.
     nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, for the intervals.
     executor : where candidates are simulated.
@@ -74,7 +73,6 @@ class Study:
     journal: Journal | None = None
     nuisance: Mapping[str, float] = field(default_factory=dict)
     independent: bool = False
-    numerics_why: str = ""
 
     def __repr__(self) -> str:
         parts = f"{len(self.train)} episodes fitted, {len(self.holdout)} held out"

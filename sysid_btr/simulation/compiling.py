@@ -42,14 +42,15 @@ def compile_model(robot: Robot, log: Log, terms: Sequence[Term], numerics: Numer
                 # a robot that is held hangs clear of the ground it would otherwise stand on
                 joint.parent.pos = np.add(joint.parent.pos, (0.0, 0.0, LIFT))
                 spec.delete(joint)
-    else:
+    elif not numerics.recorded:
         # the pyramid that MuJoCo has for a cone by default slides easier along one direction than another
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    # friction as stiff as the step allows: the default creeps and blurs reversals
-    reference = _stiffest_friction(numerics)
-    for joint in spec.joints:
-        joint.solref_friction = reference
-        joint.solimp_friction = [0.99, 0.999, 0.001, 0.5, 2.0]
+    if not numerics.recorded:
+        # friction as stiff as the step allows: the default creeps and blurs reversals
+        reference = _stiffest_friction(numerics)
+        for joint in spec.joints:
+            joint.solref_friction = reference
+            joint.solimp_friction = [0.99, 0.999, 0.001, 0.5, 2.0]
     for key in list(spec.keys):
         # the plain model's say where joints stand; of another structure they would be invalid
         spec.delete(key)

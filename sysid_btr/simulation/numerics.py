@@ -11,7 +11,7 @@ from sysid_btr.errors import UsageError
 MUJOCO = "mujoco"
 """Name of the built-in simulator."""
 
-USUAL = (("simulator", MUJOCO), ("stated", False))
+USUAL = (("simulator", MUJOCO), ("stated", False), ("recorded", False))
 """What files do not say."""
 MOST_STEPS = 1e6
 """Steps in a servo's period, beyond any that can be meant."""
@@ -29,7 +29,8 @@ class Numerics:
     With `servo_period` (s, a multiple of the step) the servos compute their torque once a period and hold it;
     without, they act as MuJoCo's own do, at every evaluation of the dynamics. `simulator` is the name of what moves the
     model, see `simulation.registry`. `stated` numerics are those in which the model is to be used: they are part of it,
-    and nothing refines them.
+    and nothing refines them. `recorded` ones are those of the MuJoCo that recorded the logs: they too are part of the
+    model, with its own settings of the solver.
 
     Raises
     ------
@@ -42,6 +43,7 @@ class Numerics:
     servo_period: float | None = None
     simulator: str = MUJOCO
     stated: bool = False
+    recorded: bool = False
 
     def __post_init__(self) -> None:
         if self.simulator == MUJOCO and self.integrator not in INTEGRATORS:
@@ -76,10 +78,10 @@ class Numerics:
 
     @property
     def exact(self) -> bool:
-        """Whether they are part of the model, so that half the step is no nearer to the truth: stated ones, and an
-        explicit Euler step a period, which is how a digital servo behaves.
+        """Whether they are part of the model, so that half the step is no nearer to the truth: those stated, those
+        recorded, and an explicit Euler step a period, which is how a digital servo behaves.
         """
-        return self.stated or self.integrator == "Euler"
+        return self.stated or self.recorded or self.integrator == "Euler"
 
     def halved(self) -> Numerics:
         return replace(self, timestep=self.timestep / 2)

@@ -67,10 +67,15 @@ def read_params(path: Path, robot: Robot) -> Params:
             term = _term(entry, places, problems, robot)
             if term is not None:
                 parts.append((term, [float(p["value"]) for p in entry["parameters"]]))
-        own = {"servo_period": None, "simulator": MUJOCO, "stated": False, **content["numerics"]}
+        own = {"servo_period": None, "simulator": MUJOCO, "stated": False, "recorded": False, **content["numerics"]}
         period = None if own["servo_period"] is None else float(own["servo_period"])
         numerics = Numerics(
-            str(own["integrator"]), float(own["timestep"]), period, str(own["simulator"]), bool(own["stated"])
+            str(own["integrator"]),
+            float(own["timestep"]),
+            period,
+            str(own["simulator"]),
+            bool(own["stated"]),
+            bool(own["recorded"]),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(
