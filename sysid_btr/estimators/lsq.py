@@ -52,7 +52,7 @@ _FIRST_DAMPING = 0.1
 
 
 _Ladder = tuple[tuple[FloatArray, float], ...]
-"""Batches of damping factors, and the share of the gain it promised by which a step makes those after it needless."""
+"""Batches of damping factors, and the share of the promised gain by which a step makes those after it needless."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,7 +395,7 @@ class LeastSquares:
             if short or promised <= tolerance * loss or slow == 2:
                 there = halted if slow == 2 else Termination.CONVERGED
                 return _Point(u, loss, steps, Termination.STALLED if model.failed.any() else there, model)
-            found = _climb(evaluator, model, u, loss, scheme.rank_tolerance, ladder, note)
+            found = _climb(evaluator, model, u, loss, scheme.rank_tolerance, ladder, promised, note)
             rough = promised <= max(_ROUGH_FRACTION, 4 * self.least_gain) * model.deviation
             rough |= promised <= tolerance * loss
             halted = Termination.CONVERGED if rough and not model.failed.any() else Termination.STALLED
@@ -436,9 +436,19 @@ class LeastSquares:
 
 
 def _climb(
-    evaluator: Evaluator, model: _Linear, u: FloatArray, loss: float, rank_tolerance: float, ladder: _Ladder, note: str
+    evaluator: Evaluator,
+    model: _Linear,
+    u: FloatArray,
+    loss: float,
+    rank_tolerance: float,
+    ladder: _Ladder,
+    promised: float,
+    note: str,
 ) -> tuple[FloatArray, float, float] | None:
-    """The best point of the batches up to the first that lowers the loss enough, its loss and its damping, or None."""
+    """The best point of the batches up to the first that lowers the loss enough, its loss and its damping, or None.
+
+    `promised` is what the undamped step does in the model.
+    """
     found: tuple[FloatArray, float, float] | None = None
     for factors, enough in ladder:
         if not len(factors):
@@ -449,7 +459,7 @@ def _climb(
         i = int(np.argmin(losses))
         if losses[i] < (loss if found is None else found[1]):
             found = trials[i], float(losses[i]), float(factors[i])
-        if found is not None and loss - found[1] >= enough * model.predicted(found[0] - u):
+        if found is not None and loss - found[1] >= enough * promised:
             break
     return found
 
