@@ -14,6 +14,7 @@ import toys
 
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
+from sysid_btr.diagnosis.elimination import eliminate
 from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
@@ -36,7 +37,7 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FreeTorquePeriodic
-from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, ViscousDamping
+from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, StribeckFriction, ViscousDamping
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
 from sysid_btr.terms.model import Model
@@ -519,3 +520,13 @@ def test_a_hypothesis_that_is_too_fast_for_the_step_is_tried_with_a_shorter_one(
     found = attempt(coarse, plain.model, soft, Selection()).fitted
     assert np.isfinite(found.holdout)
     assert found.numerics.timestep < 0.02
+
+
+def test_friction_that_falls_with_speed_by_nothing_is_dry_friction() -> None:
+    plant = Plant(CoulombFriction(KNEE), (0.3,))
+    study = make_study(toys.leg(), [recorded(plant)], threads=1)
+    state = State.of(fit(study, ["kp:*=shared"]), None)
+    falling = Hypothesis(StribeckFriction, KNEE, False, np.array([0.25, 0.05, 0.1]), 0.0)
+    state = replace(state, fitted=attempt(study, state.fitted.model, falling, STANDARD).fitted, evidence=(Evidence(),))
+    (effect,) = eliminate(state, (CoulombFriction, StribeckFriction), STANDARD, silent).effects
+    assert (effect.name, effect.places) == ("coulomb_friction", KNEE)

@@ -56,7 +56,7 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
     state = replace(state, study=study, fitted=polished).spent(polished.evaluations)
     progress(done=state.replays, total=None, best=nan, note="intervals")
     state = with_intervals(state, rules)
-    real = _distinguishable_from_nothing(state, rules)
+    real = _distinguishable_from_nothing(state, library, rules)
     if real is not None:
         state = with_intervals(real.step(removed=_gone(state, real)), rules)
     return state
@@ -144,11 +144,11 @@ def _merged(state: State, rules: Selection) -> State:
     return replace(state, fitted=replace(state.fitted, model=model), evidence=kept)
 
 
-def _distinguishable_from_nothing(state: State, rules: Selection) -> State | None:
+def _distinguishable_from_nothing(state: State, library: Library, rules: Selection) -> State | None:
     """The model without effects, and locations of effects, whose amounts may be nothing; None where there are none.
 
     Only what held-out data do not miss is dropped: of two effects that a log shows together but cannot distinguish, one
-    stays.
+    stays. Of what they do miss a special case may be enough: friction that falls with speed by nothing is dry friction.
     """
     doubtful: list[tuple[float, Effect, list[int]]] = []
     for effect in state.effects:
@@ -161,15 +161,24 @@ def _distinguishable_from_nothing(state: State, rules: Selection) -> State | Non
     result: State | None = None
     now = state
     for _, effect, kept in sorted(doubtful, key=lambda item: item[0]):
-        if not kept and len(now.effects) == 1:
-            break
-        at = now.effects.index(effect)
-        left = _at_locations(effect, kept, now)
-        fitted = refit(now.study, now.fitted.model.replaced(effect, *left), polish=True)
-        if predicts_as_well(rules, fitted, state.fitted):
-            known = (*now.evidence[:at], *((now.evidence[at],) if left else ()), *now.evidence[at + 1 :])
-            result = now = replace(now, fitted=fitted, evidence=known)
+        at, simpler = now.effects.index(effect), _special_cases(effect, library, now)
+        if kept or len(now.effects) > 1:
+            simpler.insert(0, _at_locations(effect, kept, now))
+        for left in simpler:
+            fitted = refit(now.study, now.fitted.model.replaced(effect, *left), polish=True)
+            if predicts_as_well(rules, fitted, state.fitted):
+                known = (*now.evidence[:at], *((now.evidence[at],) if left else ()), *now.evidence[at + 1 :])
+                result = now = replace(now, fitted=fitted, evidence=known)
+                break
     return result
+
+
+def _special_cases(effect: Effect, library: Library, state: State) -> list[list[tuple[Effect, FloatArray]]]:
+    """Effects of one number that an effect includes, at its places, with its first number there."""
+    first = state.fitted.model.own(effect).reshape(-1, len(effect.kinds))[:, 0]
+    kinds = [kind for kind in library if kind.name in effect.includes and len(kind.kinds) == 1 and effect.main > 0]
+    made = (kind.at(effect.places, state.study.scales, shared=effect.shared) for kind in kinds)
+    return [[(one.around(first), first)] for one in made]
 
 
 def _at_locations(effect: Effect, kept: Sequence[int], state: State) -> list[tuple[Effect, FloatArray]]:
