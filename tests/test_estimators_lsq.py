@@ -384,3 +384,20 @@ def test_a_rough_objective_is_left_where_steps_keep_little_of_what_they_promise(
         spent += result.evaluations
         assert result.loss < 1.1 * 4000
     assert spent < 500
+
+
+def test_a_narrow_valley_that_bends_is_followed_in_steps_as_long_as_it_allows() -> None:
+    """Masses and gains in common are hardly seen, their ratios well: short steps keep what little they promise."""
+    drawn = 1e-4 * np.random.default_rng(0).standard_normal(400)
+
+    def residuals(x: FloatArray) -> FloatArray:
+        mass, stiffness, damping = x.T[:, :, None]
+        t = np.linspace(0, 1, 400)
+        seen = (stiffness / mass) * np.sin(9 * t) + (damping / mass) * np.cos(7 * t) + 3e-3 * mass * np.sin(23 * t)
+        return (seen - np.sin(9 * t) - np.cos(7 * t) - 3e-3 * np.sin(23 * t) - drawn) / 1e-4
+
+    names, one = ("mass", "stiffness", "damping"), np.ones(3)
+    problem = ToyProblem(names, 0.2 * one, 4 * one, np.array([2.6, 2.5, 2.7]), residuals, one)
+    result = run(LeastSquares(max_iterations=15), problem, evaluations=300)
+    assert result.converged
+    np.testing.assert_allclose(result.x, 1.0, rtol=0.01)
