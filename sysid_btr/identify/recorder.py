@@ -23,7 +23,7 @@ from sysid_btr.terms.model import Model
 
 MEASURED = "measured"
 """`LogMeta.source` of a log that no simulator recorded."""
-SECONDS = 4.0
+SECONDS = 12.0
 """Part of each log on which steps are compared."""
 FIRST_ORDER = ("Euler", "implicitfast")
 """Integrators whose step shows."""
@@ -57,8 +57,10 @@ def as_recorded(study: Study, model: Model) -> Study:
     for numerics in others:
         moved = problem.with_numerics(numerics).residuals(model.values[None])[0]
         if np.isfinite(moved).all():
-            seen[numerics] = _mean(_excess(problem, _beside(moved, jacobian)))
-    likely = sorted((n for n in seen if seen[n] < _mean(now) - HALF), key=lambda n: (n.timestep != own, seen[n]))
+            there = _excess(problem, _beside(moved, jacobian))
+            if not _is_above(there) or _mean(there) < _mean(now) - HALF:
+                seen[numerics] = _mean(there)
+    likely = sorted(seen, key=lambda n: (n.timestep != own, seen[n]))
     left = {n: _refitted_excess(replace(short, numerics=n), n, model) for n in likely[:FITTED]}
     alike = [n for n in left if not _is_above(left[n])]
     if not alike or not _is_above(_refitted_excess(short, study.cheap, model)):
