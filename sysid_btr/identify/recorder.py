@@ -48,6 +48,8 @@ def as_recorded(study: Study, model: Model) -> Study:
         return study
     short = replace(shorten(study, SECONDS), numerics=study.numerics)
     problem = short.train_problem(model)
+    if not np.isfinite(problem.residuals(model.values[None])).all():
+        return study
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
     jacobian = np.nan_to_num(jacobian)
     now = _excess(problem, _beside(residual, jacobian))

@@ -34,7 +34,7 @@ def wanted_start(comparison: Comparison, values: FloatArray) -> Start:
     Returns
     -------
     Start
-        As it is where its correction is a parameter, or where no joint has a position.
+        As it is where its correction is a parameter, where no joint has a position, or where the replay fails.
     """
     replay, log = comparison.replay, comparison.replay.log
     here = Start(*replay.start)
@@ -55,6 +55,8 @@ def wanted_start(comparison: Comparison, values: FloatArray) -> Start:
         short = replace(replay, log=window, terms=terms, effort=False, begun=here)
         start = np.concatenate([values, np.zeros(2 * count)])
         problem = ReplayProblem((Comparison(short, targets),), start)
+        if not np.isfinite(problem.residuals(start[None])).all():
+            return here
         own = Conditional(problem, np.arange(len(start)) >= len(values), start)
         residual, jacobian = linearise(own, own.start)
         off = np.concatenate([here.position[which], here.velocity[which]]) - prior
