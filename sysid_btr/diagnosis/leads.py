@@ -12,13 +12,14 @@ import numpy as np
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.diagnosis.free_form import free_forms
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
-from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, explained_by, perturbations, responding, scan
+from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, perturbations, responding, scan
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.signature import proposals
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.journal import Record
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.missing_torque import missing_torques
+from sysid_btr.identify.projection import explained_by
 from sysid_btr.identify.refit import inflate, judge, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import body_names, joint_names

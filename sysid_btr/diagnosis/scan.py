@@ -13,6 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.identify.projection import orthonormal
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.subtrees import WHOLE_ROBOT
 from sysid_btr.terms.effect import Effect, Probe
@@ -59,12 +60,12 @@ class Residual:
     @classmethod
     def of(cls, residual: FloatArray, jacobian: FloatArray) -> Residual:
         """A residual (r,) beside parameters with these derivatives (r, p)."""
-        basis = _orthonormal(jacobian)
+        basis = orthonormal(jacobian)
         return cls(basis, np.eye(basis.shape[1]), residual - basis @ (basis.T @ residual))
 
     def beside(self, residual: FloatArray, jacobian: FloatArray) -> Residual:
         """Another residual (r,), beside some of the same parameters with these derivatives (r, q)."""
-        within = _orthonormal(self.basis.T @ jacobian)
+        within = orthonormal(self.basis.T @ jacobian)
         return replace(
             self, within=within, rest=residual - self.basis @ (within @ (within.T @ (self.basis.T @ residual)))
         )
@@ -198,22 +199,6 @@ def where_something_is(
             best[one.perturbation.place] = max(best[one.perturbation.place], one.gain)
     least = rules.costly_share * max(best.values(), default=0.0)
     return [q for q in costly if len(q.places) > 1 or best.get(q.place, least) >= least]
-
-
-def explained_by(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """The part (r,) of a residual that parameters explain, to first order, whatever their bounds."""
-    basis = _orthonormal(jacobian)
-    return np.asarray(basis @ (basis.T @ residual))
-
-
-def _orthonormal(jacobian: FloatArray) -> FloatArray:
-    """Orthonormal basis of what the declared parameters can do."""
-    norm = np.linalg.norm(jacobian, axis=0)
-    live = jacobian[:, norm > 0] / norm[norm > 0]
-    if live.shape[1] == 0:
-        return np.zeros((len(jacobian), 0))
-    u, s, _ = np.linalg.svd(live, full_matrices=False)
-    return np.asarray(u[:, s > 1e-6 * s[0]])
 
 
 def _subtree(perturbation: Perturbation, where: dict[str, int]) -> int:

@@ -19,6 +19,10 @@ PLAIN_WIDTH = 118
 CANDIDATES_SHOWN, EXACT_SHOWN = 6, 4
 PARTS = (("train", "fitted"), ("holdout", "held-out"))
 HELD_OUT = "held out"
+RECORDED = (
+    "the log moves as MuJoCo does in steps of {}, and not as in finer ones, so it is replayed in these "
+    "(others: --for INTEGRATOR:STEP)"
+)
 MENTIONED = 0.01
 """Probability from which another cause is mentioned."""
 
@@ -106,12 +110,6 @@ def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]
         + (f"; seed {result['seed']}" if result.get("seed") is not None else ""),
         style="dim",
     )
-
-
-RECORDED = (
-    "the log moves as MuJoCo does in steps of {}, and not as in finer ones, so it is replayed in these "
-    "(others: --for INTEGRATOR:STEP)"
-)
 
 
 def certainty_words(effect: Mapping[str, Any]) -> str:

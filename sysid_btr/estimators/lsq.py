@@ -1,7 +1,8 @@
 """Batched Gauss-Newton / Levenberg-Marquardt least squares in a box.
 
-One iteration is two batches: the finite-difference stencil of all parameters, and a ladder of damping factors
-of which the best is taken. Both are what a parallel simulator does well. Steps are solutions of the damped
+One iteration is two batches: the finite-difference stencil of all parameters, and the undamped step with a
+damped one; where that keeps little of what it promised a third, the rest of a ladder of damping factors, of
+which the best is taken. All are what a parallel simulator does well. Steps are solutions of the damped
 linear problem *with* the bounds, so an active bound never spoils a step.
 
 Residuals are long and parameters few: an iteration keeps only the normal matrix ``J^T J`` and ``J^T r``, and

@@ -15,6 +15,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.lsq import linearise
 from sysid_btr.identify.coarse import nearby
+from sysid_btr.identify.projection import explained_by
 from sysid_btr.identify.refit import shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
@@ -52,14 +53,14 @@ def as_recorded(study: Study, model: Model) -> Study:
         return study
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
     jacobian = np.nan_to_num(jacobian)
-    now = _excess(problem, _beside(residual, jacobian))
+    now = _excess(problem, residual - explained_by(jacobian, residual))
     if not _is_above(now):
         return study
     seen = {}
     for numerics in others:
         moved = problem.with_numerics(numerics).residuals(model.values[None])[0]
         if np.isfinite(moved).all():
-            there = _excess(problem, _beside(moved, jacobian))
+            there = _excess(problem, moved - explained_by(jacobian, moved))
             if not _is_above(there) or _mean(there) < _mean(now) - HALF:
                 seen[numerics] = _mean(there)
     likely = sorted(seen, key=lambda n: (n.timestep != own, seen[n]))
@@ -92,11 +93,6 @@ def _other_steps(study: Study) -> Iterator[Numerics]:
         steps = period / step
         if steps > 0.999 and abs(steps - round(steps)) < 1e-3 * steps:
             yield from (Numerics(name, step, recorded=True) for name in FIRST_ORDER)
-
-
-def _beside(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """What parameters leave of a residual (r,), to first order."""
-    return np.asarray(residual - jacobian @ np.linalg.lstsq(jacobian, residual, rcond=None)[0])
 
 
 def _excess(problem: ReplayProblem, residual: FloatArray) -> FloatArray:

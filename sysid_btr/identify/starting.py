@@ -46,7 +46,7 @@ def wanted_start(comparison: Comparison, values: FloatArray) -> Start:
     if not targets:
         return here
     which, count = replay.index.of(joints), len(joints)
-    known = np.concatenate(start_prior(comparison, joints))
+    known = _start_errors(comparison, joints)
     first = replace(replay, begun=None).start
     prior = np.concatenate([x[which] for x in first])
     terms = (*replay.terms, StartPosition(joints), StartVelocity(joints))
@@ -69,14 +69,13 @@ def wanted_start(comparison: Comparison, values: FloatArray) -> Start:
     return here
 
 
-def start_prior(comparison: Comparison, joints: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (k,) of positions and velocities of some joints at the first sample, see `start_error`."""
+def _start_errors(comparison: Comparison, joints: tuple[str, ...]) -> FloatArray:
+    """Standard deviations (2 k,) of positions, then velocities of some joints at the first sample: `start_error`."""
     log = comparison.replay.log
     noise = {
         j: float(t.noise[k]) for t in comparison.targets if t.channel == "position" for k, j in enumerate(t.joints)
     }
-    known = np.array([start_error(log, joint, noise.get(joint, np.inf)) for joint in joints])
-    return known[:, 0], known[:, 1]
+    return np.array([start_error(log, joint, noise.get(joint, np.inf)) for joint in joints]).T.ravel()
 
 
 def _first(target: Target, stop: int) -> Target:
