@@ -95,9 +95,10 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     hypotheses = others[: rules.exchanges]
     if part.whole:
         hypotheses += [h for h in state.evidence[at].alternatives if not _among(h, hypotheses)]
+    rest = part.without(model, state)
+    hypotheses = [h for h in hypotheses if rest.terms.admit(h.effect, h.places)]
     if not hypotheses:
         return state
-    rest = part.without(model, state)
     trials = [Trial(part.hypothesis(model), state.fitted)]
     trials += [attempt(state.study, rest, hypothesis, rules) for hypothesis in hypotheses]
     state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))

@@ -134,8 +134,4 @@ def _perturbations(state: State, library: Library, problem: ReplayProblem, resid
     asked: list[Perturbation] = perturbations(library, places, study.scales)
     asked += proposals(study, problem, problem.start, residual, library)
     terms = state.fitted.model.terms
-    present = {(type(t), p) for t in terms if t.numbers == t.kinds for p in t.places}
-    split = {p for t in terms if t.structural for p in t.places}
-    return [
-        q for q in asked if not any((q.effect, p) in present or (q.effect.structural and p in split) for p in q.places)
-    ]
+    return [q for q in asked if terms.admit(q.effect, q.places)]

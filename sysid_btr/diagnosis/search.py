@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import nan
 
+import numpy as np
+
 from sysid_btr.diagnosis.elimination import without_dispensable
 from sysid_btr.diagnosis.evidence import evidence_of, is_likely, preference, weights
 from sysid_btr.diagnosis.hypotheses import Hypothesis
@@ -60,6 +62,10 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
 
         with phase("", ROUND_SHARE):
             state, trials = _try_promising(state, library, rules, say)
+            recorded = _recorded(state, trials, rules)
+        if recorded is not None:
+            state = recorded
+            continue
         worthy = [t for t in trials if _is_worthy(rules, state, t)]
         winner = choose(rules, now, worthy)
         floating = state.study.procedure.leaves_ground_error
@@ -124,6 +130,18 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
     return state, trials
 
 
+def _recorded(state: State, trials: Sequence[Trial], rules: Selection) -> State | None:
+    """The state in the steps of a recorder that the best of some trials show, which the effect hid; None where none."""
+    finite = [t for t in trials if np.isfinite(t.fitted.misfit)]
+    for trial in sorted(finite, key=lambda t: t.fitted.misfit)[: rules.least_refits]:
+        recorded = as_recorded(state.study, trial.fitted.model)
+        if recorded is not state.study:
+            study = replace(state.study, numerics=recorded.numerics)
+            study, fitted = robust_refit(study, refit(study, state.fitted.model), 1)
+            return replace(state, study=study, fitted=fitted).spent(fitted.evaluations)
+    return None
+
+
 def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection) -> State:
     """The state with the winner of a round, all of it refitted."""
     study = state.study
@@ -144,10 +162,5 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
         fitted = refit(study, rest.with_(hypothesis.term(study.scales), hypothesis.start))
     study = study.with_initial_states(fitted.model)
     study, fitted = robust_refit(study, fitted, 1)
-    # what an effect hid may show now: see `as_recorded`
-    recorded = as_recorded(study, fitted.model)
-    if recorded is not study:
-        spent += fitted.evaluations
-        study, fitted = robust_refit(recorded, refit(recorded, fitted.model), 1)
     state = replace(state, study=study, fitted=fitted, evidence=(*staying, evidence)).spent(spent + fitted.evaluations)
     return state.step(added=(str(hypothesis),))

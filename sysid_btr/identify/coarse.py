@@ -7,15 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget, Progress, Termination, silent
-from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.deferred import LEAST_GAIN, deferred_fit
+from sysid_btr.estimators.base import Budget, Progress, silent
 from sysid_btr.identify.numerics import Beginning, converged, held_numerics
-from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, refit, robust_refit, shorten
+from sysid_btr.identify.recorder import as_recorded
+from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, nearby, refit, robust_refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.identify.thresholds import with_reached_limits, without_unreached_limits
-from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.model import Model
 
 MISFIT = 1.5
@@ -32,6 +29,11 @@ STIFFER = (0.6, 0.35, 0.25)
 def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress = silent) -> tuple[Study, Fitted]:
     """The study with each column weighed by the error that a first fit from a model leaves in it, and that fit."""
     study, coarse = first_fit(study, model, budget, progress)
+    recorded = as_recorded(study, coarse.model)
+    if recorded is not study:
+        spent = coarse.evaluations
+        study, coarse = first_fit(recorded, coarse.model, budget.after(spent), progress)
+        coarse = replace(coarse, evaluations=coarse.evaluations + spent)
     if float(coarse.train_columns.max()) > MISFIT:
         if not study.procedure.weighs_segments:
             study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS, budget, progress)
@@ -61,18 +63,6 @@ def realise_servo(study: Study, model: Model) -> Study:
     part = Beginning.of(log)
     found, _ = converged(held, lambda n: part.positions(robot, n, threads), part.log)
     return replace(study, numerics=found)
-
-
-def nearby(study: Study, cheap: Numerics, model: Model) -> tuple[float, Model]:
-    """Mean log chi2 of fitted columns where a few steps from a model lead, by the derivatives of cheap numerics."""
-    problem = study.train_problem(model)
-    estimator = LeastSquares(confirm=False, max_iterations=4, tolerance=2e-4, least_gain=LEAST_GAIN)
-    rng, journal = np.random.default_rng(0), Journal()
-    found = deferred_fit(problem, cheap, estimator, rng=rng, budget=Budget(), journal=journal, progress=silent)
-    if found.termination is Termination.INTERRUPTED:
-        raise KeyboardInterrupt
-    chi2 = problem.column_chi2(problem.residuals(found.x[None])[0])
-    return float(np.mean(np.log(chi2))), model.at(found.x)
 
 
 def first_fit(study: Study, model: Model, budget: Budget, progress: Progress = silent) -> tuple[Study, Fitted]:

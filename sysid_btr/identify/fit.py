@@ -186,7 +186,7 @@ def fit(
     budget = budget or Budget()
     search = _Search(estimator, distance, rng, budget, Journal() if journal is None else journal, progress)
     with phase("search", 0.7):
-        solved = search.run(as_recorded(realise_servo(study, model), model), model)
+        solved = search.run(realise_servo(study, model), model)
     study, replays = solved.study, solved.replays
     at = Optimum.of(solved.problem, solved.result, study.stencil(terms))
     if solved.by_residuals:
@@ -275,6 +275,8 @@ class _Search:
             journal = journal.section()
             problem = study.train_problem(model.at(explored.x))
         if not uses_residuals(estimator):
+            study = as_recorded(study, problem.model)
+            problem = study.train_problem(problem.model)
             goal = problem if self.distance is None else DistanceProblem(problem, self.distance)
             result = estimator.fit(goal, rng=rng, budget=budget, journal=journal, progress=progress)
             return _Solved(study, problem, result, result.evaluations + spent, False)

@@ -14,9 +14,8 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.coarse import nearby
 from sysid_btr.identify.projection import explained_by
-from sysid_btr.identify.refit import shorten
+from sysid_btr.identify.refit import nearby, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.numerics import MUJOCO, Numerics

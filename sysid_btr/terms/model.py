@@ -88,6 +88,22 @@ class Terms(tuple[Term, ...]):
         """Whether any of them adds joints to the model."""
         return any(term.structural for term in self)
 
+    def admit(self, kind: type[Term], places: Iterable[str]) -> bool:
+        """Whether a further term may act at these places.
+
+        Not where one of its kind is free already, with numbers of each place's own, and not where another adds a joint
+        and it does too.
+        """
+        at = set(places)
+
+        def excludes(term: Term) -> bool:
+            own = len(term.groups) == len(term.places) and term.numbers == term.kinds
+            return bool(at.intersection(term.places)) and (
+                (type(term) is kind and own) or (term.structural and kind.structural)
+            )
+
+        return not any(excludes(term) for term in self)
+
     @property
     def have_laws(self) -> bool:
         """Whether any of them acts at every step of a replay."""

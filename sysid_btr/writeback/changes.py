@@ -39,7 +39,7 @@ class Change:
     line : the change in one line.
     """
 
-    kind: str
+    kind: Kind
     name: str
     attribute: str
     before: tuple[float, ...] | str
@@ -139,6 +139,12 @@ def _place(model: mujoco.MjModel, kind: Kind, i: int) -> tuple[str, str]:
     if kind == "body":
         return name, name.removeprefix("payload_")
     return name, name.removesuffix(LINK_SUFFIX)
+
+
+def place_of(model: mujoco.MjModel, change: Change) -> str:
+    """The joint or body that a term would call what is changed by."""
+    found = (_place(model, change.kind, i) for i in range(count(model, change.kind)))
+    return next((place for name, place in found if name == change.name), change.name)
 
 
 def _values(

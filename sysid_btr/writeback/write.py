@@ -20,7 +20,7 @@ from sysid_btr.run_folder import MODEL, PARAMS, Folder, make_relative
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
 from sysid_btr.version import __version__
-from sysid_btr.writeback.changes import SOLVER, Change, changes_of, describe
+from sysid_btr.writeback.changes import SOLVER, Change, changes_of, describe, place_of
 from sysid_btr.writeback.features import Kind
 from sysid_btr.writeback.filed import loss_of, of_file, stands_alone
 from sysid_btr.writeback.native import Part
@@ -178,10 +178,13 @@ def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], 
         if part.stand_in is None or (part.stand_in is part.term and (part.term.declared or not part.term.kinds)):
             continue
         for change in changes:
-            key: tuple[Kind, str] = (change.kind, change.name)  # type: ignore[assignment]
+            key = (change.kind, change.name)
             if part.term.called not in change.by or change.attribute in SOLVER or change.kind == "geom":
                 continue
-            place = change.name.removesuffix("__link").removeprefix("payload_")
+            place = place_of(target.model, change)
+            if change.kind in ("actuator", "joint") and place not in part.term.places:
+                # another term of that name asks for it
+                continue
             words = describe(part, place)
             if words not in notes.get(key, ""):
                 notes[key] = f"{notes[key]}; {words}" if key in notes else f"sysid_btr: {words}"
