@@ -90,7 +90,7 @@ def form_hypotheses(found: Sequence[Sensitivity], residuals: int, scales: Scales
             if agree(values[:, effect.main], rules.common_spread):
                 result.append(Hypothesis(effect, group.places, True, np.median(values, axis=0), group.gain))
     result.sort(key=lambda h: -h.gain)
-    return _varied(_without_outranked(_without_idle(result, rules), rules), rules)
+    return _varied(_without_idle(result, rules), rules)
 
 
 def to_arrays(
@@ -198,20 +198,6 @@ def _without_idle(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypoth
     """Drop an effect that includes a simpler one where all that it adds is zero."""
     named = {h.effect.name for h in ranked}
     return [h for h in ranked if not (named & set(h.effect.includes) and _idle(h, rules))]
-
-
-def _without_outranked(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
-    """Drop an effect where one that it yields to promises as much at the same places: more damping, in a gain."""
-    return [
-        h
-        for h in ranked
-        if not any(
-            other.effect.name in h.effect.yields_to
-            and set(other.places) == set(h.places)
-            and other.gain >= h.gain - rules.candidate_gain
-            for other in ranked
-        )
-    ]
 
 
 def _idle(h: Hypothesis, rules: Selection) -> bool:

@@ -18,7 +18,7 @@ from sysid_btr.identify.projection import explained_by
 from sysid_btr.identify.refit import nearby, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.numerics import MUJOCO, Numerics
+from sysid_btr.simulation.numerics import INTEGRATORS, MUJOCO, Numerics
 from sysid_btr.terms.model import Model
 
 MEASURED = "measured"
@@ -77,6 +77,18 @@ def _refitted_excess(study: Study, cheap: Numerics, model: Model) -> FloatArray:
         study = study.with_initial_states(model, held_out=False)
     problem = study.train_problem(model)
     return _excess(problem, problem.residuals(model.values[None])[0])
+
+
+def own_steps(study: Study) -> Numerics | None:
+    """Those of the model file; None where the logs were not recorded in them, or their noise is larger than a step."""
+    own, others = study.robot.model.opt, list(_other_steps(study))
+    same = (n for n in others if (n.timestep, INTEGRATORS.index(n.integrator)) == (own.timestep, own.integrator))
+    numerics = next(same, None)
+    if numerics is None:
+        return None
+    problem, plain = shorten(study, SECONDS).train_problem(()), np.zeros((1, 0))
+    change = problem.with_numerics(numerics).residuals(plain)[0] - problem.residuals(plain)[0]
+    return numerics if np.isfinite(change).all() and float(problem.column_chi2(change).max()) > 1 else None
 
 
 def _other_steps(study: Study) -> Iterator[Numerics]:

@@ -59,10 +59,9 @@ class Kv(Effect):
     """
 
     name: ClassVar[str] = "kv"
-    family: ClassVar[str] = "gain"
     title: ClassVar[str] = "change of the servo's damping"
+    usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
-    yields_to: ClassVar[tuple[str, ...]] = ("viscous_damping",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("viscous_damping", "a logged effort or current; the two are confounded in positions alone"),
     )
