@@ -28,10 +28,15 @@ FINE = Numerics("RK4", 0.0005)
 
 
 @lru_cache
-def stepped(integrator: str, timestep: float, seconds: float, friction: float) -> tuple[FloatArray, ...]:
-    """Time, commands, positions and velocities (n, 3) of the leg in MuJoCo."""
+def stepped(
+    integrator: str, timestep: float, seconds: float, friction: float, gain: float = 1.0
+) -> tuple[FloatArray, ...]:
+    """Time, commands, positions and velocities (n, 3) of the leg in MuJoCo, with a factor of the knee's kp."""
     spec = toys.leg().make_spec()
     spec.joint("knee").frictionloss = friction
+    servo = next(a for a in spec.actuators if a.target == "knee")
+    servo.gainprm[0] *= gain
+    servo.biasprm[1] *= gain
     model = spec.compile()
     model.opt.timestep, model.opt.integrator = timestep, INTEGRATORS.index(integrator)
     data, time = mujoco.MjData(model), PERIOD * np.arange(round(seconds / PERIOD))
@@ -44,9 +49,11 @@ def stepped(integrator: str, timestep: float, seconds: float, friction: float) -
     return time, command, position, velocity
 
 
-def mujoco_log(integrator: str, timestep: float, skipped: float = 0.0, friction: float = 0.0) -> Log:
+def mujoco_log(
+    integrator: str, timestep: float, skipped: float = 0.0, friction: float = 0.0, gain: float = 1.0
+) -> Log:
     """What anybody records who steps the leg in MuJoCo; `skipped` s of it come before the log."""
-    time, command, position, _ = stepped(integrator, timestep, 8.0 + skipped, friction)
+    time, command, position, _ = stepped(integrator, timestep, 8.0 + skipped, friction, gain)
     seen = position + np.random.default_rng(2).normal(0, NOISE, position.shape)
     first = round(skipped / PERIOD)
     channels = {}
@@ -76,6 +83,24 @@ def test_friction_hides_the_steps_until_it_is_found() -> None:
     (effect,) = found.effects
     assert (effect.effect, effect.where, found.study.numerics.recorded) == ("coulomb_friction", ("knee",), True)
     assert effect.parameters[0].value == pytest.approx(0.1, rel=0.01)
+
+
+def test_the_steps_are_found_far_from_the_nominal_gains() -> None:
+    found = fit(make_study(toys.leg(), [mujoco_log("Euler", 0.002, gain=0.6)]), ("mass:knee", "kp:*", "kv:*"))
+    assert found.study.numerics.recorded
+    for one in found.estimates:
+        truth = 0.6 if one.name == "kp:knee" else 1.0
+        assert one.ci95[0] <= truth <= one.ci95[1], one
+
+
+def test_one_joints_gain_is_found_beside_those_that_are_fitted_alike() -> None:
+    log = mujoco_log("Euler", 0.002, gain=0.7)
+    found = close(make_study(toys.leg(), [log]), ("mass:*", *GAINS), effects=("kp", "viscous_damping", "armature"))
+    (effect,) = found.effects
+    assert (effect.effect, effect.where, found.verdict) == ("kp", ("knee",), "explained")
+    assert effect.parameters[0].value == pytest.approx(0.7, rel=0.002)
+    shared = next(one for one in found.parameters if one.name == "kp:*")
+    assert shared.ci95[0] <= 1 <= shared.ci95[1]
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.02, 0.2])

@@ -14,6 +14,7 @@ from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.inertial import ComOffset, Mass
 from sysid_btr.terms.model import Model, Terms, as_model
 from sysid_btr.terms.servo import Kp
+from sysid_btr.terms.transmission import Backlash, JointCompliance
 
 KINDS = (Mass, ComOffset, Kp, CoulombFriction)
 
@@ -81,3 +82,17 @@ def test_what_was_worked_out_of_terms_is_not_sent() -> None:
     assert terms.parameters
     assert pickle.dumps(terms) == bare
     assert pickle.loads(bare) == terms
+
+
+def test_what_is_free_for_all_places_alike_leaves_each_its_own() -> None:
+    alike, own = Terms([Kp(("a", "b"), shared=True)]), Terms([Kp(("a", "b"))])
+    assert alike.admit(Kp, ("a",))
+    assert not own.admit(Kp, ("b", "c"))
+    assert own.admit(Kp, ("c",))
+
+
+def test_a_joint_is_split_once() -> None:
+    play = Terms([Backlash(("a",))])
+    assert not play.admit(JointCompliance, ("b", "a"))
+    assert play.admit(JointCompliance, ("b",))
+    assert play.admit(CoulombFriction, ("a",))

@@ -41,7 +41,7 @@ from sysid_btr.terms.inertial import GravityTilt, Payload
 from sysid_btr.terms.limits import TorqueLimit
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderOffset, EncoderOffsetInLoop
-from sysid_btr.terms.servo import CommandDelay, IntegralGain
+from sysid_btr.terms.servo import CommandDelay, IntegralGain, Kp
 from sysid_btr.terms.spring import JointSpring
 from sysid_btr.terms.transmission import Backlash, JointCompliance
 from sysid_btr.writeback.params import read_params, starts_from
@@ -652,6 +652,16 @@ def test_a_spring_that_is_a_constant_torque_is_called_that(own: Path) -> None:
     made = draft(declared(own, ["constant_force:hip"], [0.5]))
     assert all("(constant_force: torque 0.5 Nm)" in c.line for c in made.changes if c.kind == "joint")
     assert "<!-- sysid_btr: constant_force of hip: torque 0.5 Nm -->" in made.text().decode()
+
+
+def test_one_joints_gain_beside_a_common_one_is_told_at_that_joint(own: Path) -> None:
+    study = study_of(load_robot(str(own)))
+    common = parse_parameters(["kp:*=shared"], study.robot)
+    made = draft(model_of(study, (*common, effect(Kp, "knee")), [0.9, 0.7]))
+    lines = made.text().decode().splitlines()
+    (told,) = (i for i, line in enumerate(lines) if "sysid_btr: kp" in line)
+    assert "kp of knee: scale 0.7 " in lines[told]
+    assert 'joint="knee"' in lines[told + 1]
 
 
 def test_parameters_read_back_and_replay_the_same(fitted: Any, out: Folder) -> None:
