@@ -91,10 +91,11 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     """The state with a part as it is, or with what predicts better, or as well and is simpler, in its place."""
     model, at = state.fitted.model, state.effects.index(part.effect)
     # a generalisation of what is there would have taken its place in the search
-    others = [h for h in others if part.effect.name not in h.effect.includes]
+    others = [h for h in others if part.effect.name not in h.effect.includes and not _said_of_more(h, part, model)]
     hypotheses = others[: rules.exchanges]
     if part.whole:
         hypotheses += [h for h in state.evidence[at].alternatives if not _among(h, hypotheses)]
+        hypotheses += [h for h in _at_fewer(part, model) if not _among(h, hypotheses)]
     rest = part.without(model, state)
     hypotheses = [h for h in hypotheses if rest.terms.admit(h.effect, h.places)]
     if not hypotheses:
@@ -114,6 +115,27 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     left = state.without_evidence_of(part.effect) if part.whole else state.evidence
     state = replace(state, fitted=winner.fitted, evidence=(*left, known))
     return state.step(added=(str(winner.hypothesis),), removed=(str(part),))
+
+
+def _others(kind: type[Effect], places: Sequence[str], model: Model) -> set[tuple[str, ...]]:
+    """Where else the same can be said: at the other places of a term that is free for all alike."""
+    alike = [t for t in model.terms if type(t) is kind and len(t.groups) == 1 and set(places) < set(t.places)]
+    return {tuple(place for place in term.places if place not in places) for term in alike}
+
+
+def _at_fewer(part: _Part, model: Model) -> list[Hypothesis]:
+    """The same said of fewer places: what most have is what all have."""
+    nominal, own = (v.reshape(-1, len(part.effect.kinds)) for v in (part.effect.neutral, model.own(part.effect)))
+    kind, there = type(part.effect), 2 * nominal[0] - np.median(own, axis=0)
+    fewer = [places for places in _others(kind, part.places, model) if len(places) < len(part.places)]
+    return [Hypothesis(kind, places, False, np.tile(there, len(places)), 0.0) for places in fewer]
+
+
+def _said_of_more(hypothesis: Hypothesis, part: _Part, model: Model) -> bool:
+    """Whether a hypothesis is the same as a part, said of more places."""
+    if hypothesis.effect is not type(part.effect) or len(hypothesis.places) <= len(part.places):
+        return False
+    return any(set(places) == set(hypothesis.places) for places in _others(hypothesis.effect, part.places, model))
 
 
 def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:

@@ -82,12 +82,15 @@ def form_hypotheses(found: Sequence[Sensitivity], residuals: int, scales: Scales
             continue
         lead = own[0]
         result.append(Hypothesis(effect, (lead.perturbation.place,), False, lead.values, lead.gain))
+        if not effect.everywhere and len(own) > 1 and own[1].gain >= rules.location_rival * lead.gain:
+            # what neighbours would do is alike to first order
+            result.append(Hypothesis(effect, (own[1].perturbation.place,), False, own[1].values, own[1].gain))
         candidates = [s for s in own if s.gain >= rules.location_rival * best_at[s.perturbation.place]]
         group = _grow(lead, candidates, residuals, rules)
         if len(group.members) > 1:
             values = group.values(scales)
             result.append(Hypothesis(effect, group.places, False, values.ravel(), group.gain))
-            if agree(values[:, effect.main], rules.common_spread):
+            if effect.everywhere and agree(values[:, effect.main], rules.common_spread):
                 result.append(Hypothesis(effect, group.places, True, np.median(values, axis=0), group.gain))
     result.sort(key=lambda h: -h.gain)
     return _varied(_without_idle(result, rules), rules)

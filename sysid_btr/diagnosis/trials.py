@@ -33,8 +33,7 @@ def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection)
     guesses = hypothesis.initial_guesses()
     terms = rest.with_(hypothesis.term(study.scales), guesses[0]).terms
     starts = np.column_stack([np.tile(rest.values, (len(guesses), 1)), guesses])
-    if study.procedure.wanders:
-        starts = np.vstack([starts, np.column_stack([np.tile(rest.terms.nominal, (len(guesses), 1)), guesses])])
+    starts = np.vstack([starts, np.column_stack([np.tile(rest.terms.nominal, (len(guesses), 1)), guesses])])
     seconds = rules.refit_seconds if len(starts) <= rules.start_few else rules.start_seconds
     spent = 0
     while True:
