@@ -73,7 +73,8 @@ def test_every_effect_can_be_freed_whole_in_part_and_by_its_variant() -> None:
     [
         ("mass:toe", ("'toe'", "body", "hip, knee, ankle")),
         ("kp:elbow", ("'elbow'", "joint with a servo", "hip, knee, ankle")),
-        ("mas:knee", ("'mas'", "did you mean 'mass'", "frictionloss")),
+        ("mas:knee", ("'mas'", "did you mean 'mass'", "lists all")),
+        ("zzz:knee", ("'zzz'", "fields are mass", "frictionloss")),
         ("mass", ("FIELD:GLOB",)),
         ("mass:", ("FIELD:GLOB",)),
         ("mass:knee=same", ("'same'", "shared")),

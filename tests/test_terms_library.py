@@ -61,8 +61,10 @@ def test_effects_are_chosen_by_name_and_a_wrong_name_is_told() -> None:
         "kp", "coulomb_friction", "command_delay"
     ]  # fmt: skip
     assert {e.name for e in select_effects(["backlash", "payload"])} == {"backlash", "payload"}
-    with pytest.raises(UsageError, match=r"'backlsh' \(did you mean 'backlash'\?\).*coulomb_friction"):
+    with pytest.raises(UsageError, match=r"'backlsh' \(did you mean 'backlash'\?\)$"):
         select_effects(["backlsh"])
+    with pytest.raises(UsageError, match=r"'zzz'; effects are .*coulomb_friction"):
+        select_effects(["zzz"])
 
 
 @dataclass(frozen=True)

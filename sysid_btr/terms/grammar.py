@@ -106,8 +106,11 @@ def _declared(label: str, table: Mapping[str, type[Term]]) -> Term:
     name = label if label in table or stem not in table else stem
     if name not in table:
         meant = ALSO_CALLED.get(name) or next(iter(difflib.get_close_matches(name, table, n=1)), None)
-        hint = f" (did you mean {meant!r}?)" if meant else ""
-        raise UsageError(f"unknown field {name!r}{hint}; fields are {', '.join(table)}")
+        if meant:
+            raise UsageError(
+                f"unknown field {name!r} (did you mean {meant!r}?); `sysid-btr fit` with --model alone lists all"
+            )
+        raise UsageError(f"unknown field {name!r}; fields are {', '.join(n for n in table if '.' not in n)}")
     bare = table[name](places=(), declared=name)
     if name == label:
         return bare

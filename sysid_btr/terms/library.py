@@ -160,10 +160,11 @@ def select_effects(names: Sequence[str]) -> tuple[type[Effect], ...]:
     called = {other: e.name for e in there for other in (e.name, *e.also, *([e.field] if e.field else []))}
     unknown = [n for n in names if n not in called]
     if unknown:
-        hints = [difflib.get_close_matches(n, called, n=1) for n in unknown]
+        hints = [difflib.get_close_matches(n, called, n=1) or [c for c in called if n in c] for n in unknown]
         listed = ", ".join(
-            f"{n!r}" + (f" (did you mean {h[0]!r}?)" if h else "") for n, h in zip(unknown, hints, strict=True)
+            f"{n!r}" + (f" (did you mean {' or '.join(map(repr, h))}?)" if h else "") for n, h in zip(unknown, hints, strict=True)
         )
-        raise UsageError(f"unknown effect {listed}; effects are {', '.join(effect_names())}, or all")
+        known = "" if all(hints) else f"; effects are {', '.join(effect_names())}, or all"
+        raise UsageError(f"unknown effect {listed}{known}")
     wanted = {called[n] for n in names}
     return tuple(e for e in there if e.name in wanted)

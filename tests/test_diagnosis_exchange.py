@@ -1,0 +1,40 @@
+"""The same said of other places: what most joints have, beside a term that is free for all alike, is what all have."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid_btr.diagnosis.exchange import _at_fewer, _Part, _said_of_more
+from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.model import Model
+from sysid_btr.terms.servo import Kp
+
+COMMON = Kp(("hip", "knee", "ankle"), shared=True)
+
+
+def part_of(*places: str, amount: float) -> tuple[_Part, Model]:
+    effect = Kp(places)
+    return _Part(effect, places), Model.of((COMMON, effect), [0.9, *np.full(len(places), amount)])
+
+
+def test_a_gain_of_most_joints_may_be_one_of_the_others() -> None:
+    (found,) = _at_fewer(*part_of("hip", "knee", amount=1.25))
+    assert found.places == ("ankle",)
+    assert found.start == pytest.approx([0.75])
+    assert not _at_fewer(*part_of("hip", amount=1.25))
+
+
+def test_a_gain_of_one_joint_is_not_said_of_the_others() -> None:
+    part, model = part_of("ankle", amount=0.8)
+    other = Hypothesis(Kp, ("knee", "hip"), False, np.full(2, 1.25), 1.0)
+    assert _said_of_more(other, part, model)
+    assert not _said_of_more(Hypothesis(CoulombFriction, ("knee", "hip"), False, np.ones(2), 1.0), part, model)
+    assert not _said_of_more(Hypothesis(Kp, ("knee",), False, np.ones(1), 1.0), part, model)
+
+
+def test_without_a_term_for_all_places_are_what_they_are() -> None:
+    effect = Kp(("hip", "knee"))
+    alone = Model.of((CoulombFriction(("hip", "knee", "ankle"), shared=True), effect), [0.1, 1.25, 1.25])
+    assert not _at_fewer(_Part(effect, effect.places), alone)
