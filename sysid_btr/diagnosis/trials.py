@@ -27,13 +27,12 @@ class Trial:
 def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
     """The model with a hypothesis added, refitted from the best of its initial guesses.
 
-    What was fitted without it may have taken its part: where that leads far away, the others' nominal values are tried
-    too.
+    What was fitted without it may have taken its part, so the others' nominal values are tried too.
     """
     guesses = hypothesis.initial_guesses()
     terms = rest.with_(hypothesis.term(study.scales), guesses[0]).terms
-    starts = np.column_stack([np.tile(rest.values, (len(guesses), 1)), guesses])
-    starts = np.vstack([starts, np.column_stack([np.tile(rest.terms.nominal, (len(guesses), 1)), guesses])])
+    fitted, nominal = (np.tile(v, (len(guesses), 1)) for v in (rest.values, rest.terms.nominal))
+    starts = np.vstack([np.hstack([fitted, guesses]), np.hstack([nominal, guesses])])
     seconds = rules.refit_seconds if len(starts) <= rules.start_few else rules.start_seconds
     spent = 0
     while True:
