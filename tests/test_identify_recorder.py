@@ -13,7 +13,7 @@ import toys
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.close import close
 from sysid_btr.identify.fit import fit
-from sysid_btr.identify.recorder import as_recorded
+from sysid_btr.identify.recorder import as_recorded, own_steps
 from sysid_btr.identify.starting import wanted_start
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
@@ -120,6 +120,20 @@ def test_a_measured_robot_is_never_a_simulator() -> None:
     log = replace(log, meta=replace(log.meta, source="measured"))
     study = make_study(toys.leg(), [log])
     assert as_recorded(study, Model.of(parse_parameters(["kp:*=shared"], study.robot))) is study
+
+
+def test_a_model_files_own_steps_are_tried_where_they_show() -> None:
+    log = mujoco_log("Euler", 0.002)
+    study = make_study(toys.leg(), [log])
+    own = own_steps(study)
+    option = study.robot.model.opt
+    assert own is not None
+    assert (own.timestep, INTEGRATORS.index(own.integrator), own.recorded) == (option.timestep, option.integrator, True)
+    assert own_steps(replace(study, numerics=own)) is None
+    measured = replace(log, meta=replace(log.meta, source="measured"))
+    assert own_steps(make_study(toys.leg(), [measured])) is None
+    coarse = replace(log, meta=replace(log.meta, noise={"position": 0.01}))
+    assert own_steps(make_study(toys.leg(), [coarse])) is None
 
 
 def test_a_replay_starts_where_its_first_second_wants_it() -> None:

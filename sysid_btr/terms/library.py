@@ -162,7 +162,8 @@ def select_effects(names: Sequence[str]) -> tuple[type[Effect], ...]:
     if unknown:
         hints = [difflib.get_close_matches(n, called, n=1) or [c for c in called if n in c] for n in unknown]
         listed = ", ".join(
-            f"{n!r}" + (f" (did you mean {' or '.join(map(repr, h))}?)" if h else "") for n, h in zip(unknown, hints, strict=True)
+            f"{n!r}" + (f" (did you mean {' or '.join(map(repr, h))}?)" if h else "")
+            for n, h in zip(unknown, hints, strict=True)
         )
         known = "" if all(hints) else f"; effects are {', '.join(effect_names())}, or all"
         raise UsageError(f"unknown effect {listed}{known}")
