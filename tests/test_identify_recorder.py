@@ -49,9 +49,7 @@ def stepped(
     return time, command, position, velocity
 
 
-def mujoco_log(
-    integrator: str, timestep: float, skipped: float = 0.0, friction: float = 0.0, gain: float = 1.0
-) -> Log:
+def mujoco_log(integrator: str, timestep: float, skipped: float = 0.0, friction: float = 0.0, gain: float = 1.0) -> Log:
     """What anybody records who steps the leg in MuJoCo; `skipped` s of it come before the log."""
     time, command, position, _ = stepped(integrator, timestep, 8.0 + skipped, friction, gain)
     seen = position + np.random.default_rng(2).normal(0, NOISE, position.shape)
