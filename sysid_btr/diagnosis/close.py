@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.closing import Closing, Verdict
+from sysid_btr.diagnosis.closing import Closing
 from sysid_btr.diagnosis.elimination import eliminate
 from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
@@ -22,7 +22,6 @@ from sysid_btr.errors import LogError
 from sysid_btr.estimators.base import Progress
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import fit
-from sysid_btr.identify.recorder import own_steps
 from sysid_btr.identify.study import Study
 from sysid_btr.io._text import some
 from sysid_btr.io.noise import is_white
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
 
     from sysid_btr.io.log import Log
 
-SHORT: tuple[Verdict, ...] = ("unexplained", "partly_explained")
-"""Verdicts that leave more than noise."""
 OF_DRIVES = ("delay", "gain", "saturation", "servo law", "supply")
 """Families of what a drive makes of its command: none where the torque that it gave moves the model."""
 
@@ -86,34 +83,25 @@ def close(
     if "all" in effects:
         asked = (*asked, *FREE_FORMS)
     require_motion(study)
-
-    def closed(study: Study, journal: Journal | None) -> Closing:
-        while True:
-            with phase("fit", 0.2):
-                first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
-            state = State.of(first, journal)
-            library = usable_effects(asked, study)
-            with phase("search", 0.7):
-                state = search(state, library, selection, progress)
-            with phase("elimination", 0.8):
-                state = with_discrepancy(eliminate(state, library, selection, progress))
-            floating = state.study.procedure.leaves_ground_error
-            named = named_effects(state, selection)
-            verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)
-            later = later_split(state.study, state.fitted, selection) if verdict in SHORT else None
-            if later is None:
-                return conclude(state, verdict, named, selection, perf_counter() - began)
-            # what is missing shows only after the fitted part: fit more of the log, hold out what is left
-            study = replace(later, numerics=first.study.numerics, inflation={}, independent=False)
-            journal = later.journal and later.journal.section()
-
-    found = closed(study, journal)
-    own = own_steps(study) if found.verdict in SHORT else None
-    if own is None:
-        return found
-    # what the steps of a simulator do wrong can hide everything else
-    again = closed(replace(study, numerics=own), journal and journal.section())
-    return found if again.verdict in SHORT else again
+    while True:
+        with phase("fit", 0.2):
+            first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
+        state = State.of(first, journal)
+        library = usable_effects(asked, study)
+        with phase("search", 0.7):
+            state = search(state, library, selection, progress)
+        with phase("elimination", 0.8):
+            state = with_discrepancy(eliminate(state, library, selection, progress))
+        floating = state.study.procedure.leaves_ground_error
+        named = named_effects(state, selection)
+        verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)
+        short = verdict in ("unexplained", "partly_explained")
+        later = later_split(state.study, state.fitted, selection) if short else None
+        if later is None:
+            return conclude(state, verdict, named, selection, perf_counter() - began)
+        # what is missing shows only after the fitted part: fit more of the log, hold out what is left
+        study = replace(later, numerics=first.study.numerics, inflation={}, independent=False)
+        journal = later.journal and later.journal.section()
 
 
 def require_motion(study: Study) -> None:

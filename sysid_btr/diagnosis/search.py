@@ -32,12 +32,14 @@ from sysid_btr.diagnosis.trials import (
     is_superfluous,
 )
 from sysid_btr.estimators.base import Progress
-from sysid_btr.identify.recorder import as_recorded
+from sysid_btr.identify.recorder import as_recorded, own_steps
 from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.progress import phase
 from sysid_btr.terms.free_form import FREE_FORMS
 
 Say = Callable[[str], None]
+OWN_STEPS_FROM = 3
+"""Round from which more would be named, and before which the model file's own steps are tried. Time."""
 ROUND_SHARE = 0.35
 """Expected fraction of a round in what is left of a search."""
 
@@ -54,6 +56,8 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
     for number in range(1, rules.rounds + 1):
         if at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted):
             break
+        if number == OWN_STEPS_FROM and (other := _in_own_steps(state, library, rules, progress)) is not None:
+            return other
         now = state.fitted
 
         def say(note: str, number: int = number, at: State = state) -> None:
@@ -140,6 +144,19 @@ def _recorded(state: State, trials: Sequence[Trial], rules: Selection) -> State 
             study, fitted = robust_refit(study, refit(study, state.fitted.model), 1)
             return replace(state, study=study, fitted=fitted).spent(fitted.evaluations)
     return None
+
+
+def _in_own_steps(state: State, library: Library, rules: Selection, progress: Progress) -> State | None:
+    """What is found in the model file's own steps, if that is no more and leaves nothing; else None."""
+    own = own_steps(state.study)
+    if own is None:
+        return None
+    study = replace(state.study, numerics=own)
+    declared = state.first.model
+    study, fitted = robust_refit(study, refit(study, declared.at(declared.terms.begin)), 1)
+    plain = replace(state, study=study, fitted=fitted, evidence=(), steps=state.steps[:1]).spent(fitted.evaluations)
+    found = search(plain, library, replace(rules, rounds=OWN_STEPS_FROM - 1), progress)
+    return found if at_floor(rules, found.fitted) else None
 
 
 def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection) -> State:

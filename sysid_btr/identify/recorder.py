@@ -86,7 +86,7 @@ def own_steps(study: Study) -> Numerics | None:
     numerics = next(same, None)
     if numerics is None:
         return None
-    problem, plain = shorten(study, SECONDS).train_problem(()), np.zeros((1, 0))
+    problem, plain = shorten(replace(study, inflation={}), SECONDS).train_problem(()), np.zeros((1, 0))
     change = problem.with_numerics(numerics).residuals(plain)[0] - problem.residuals(plain)[0]
     return numerics if np.isfinite(change).all() and float(problem.column_chi2(change).max()) > 1 else None
 
