@@ -182,7 +182,8 @@ def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], 
             if part.term.called not in change.by or change.attribute in SOLVER or change.kind == "geom":
                 continue
             place = place_of(target.model, change)
-            if change.kind in ("actuator", "joint") and place not in part.term.places:
+            elsewhere = place not in part.term.places and part.term.places != ("robot",)
+            if elsewhere and change.kind in ("actuator", "joint"):
                 # another term of that name asks for it
                 continue
             words = describe(part, place)
