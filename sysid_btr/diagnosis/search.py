@@ -35,7 +35,9 @@ from sysid_btr.estimators.base import Progress
 from sysid_btr.identify.recorder import as_recorded, own_steps
 from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.progress import phase
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.free_form import FREE_FORMS
+from sysid_btr.terms.model import Model
 
 Say = Callable[[str], None]
 OWN_STEPS_FROM = 3
@@ -56,8 +58,11 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
     for number in range(1, rules.rounds + 1):
         if at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted):
             break
-        if number == OWN_STEPS_FROM and (other := _in_own_steps(state, library, rules, progress)) is not None:
-            return other
+        if number == OWN_STEPS_FROM:
+            tried = _in_own_steps(state, library, rules, progress)
+            if tried.study.numerics != state.study.numerics:
+                return tried
+            state = tried
         now = state.fitted
 
         def say(note: str, number: int = number, at: State = state) -> None:
@@ -136,27 +141,32 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
 
 def _recorded(state: State, trials: Sequence[Trial], rules: Selection) -> State | None:
     """The state in the steps of a recorder that the best of some trials show, which the effect hid; None where none."""
+    if any(at_floor(rules, trial.fitted) for trial in trials):
+        return None
     finite = [t for t in trials if np.isfinite(t.fitted.misfit)]
     for trial in sorted(finite, key=lambda t: t.fitted.misfit)[: rules.least_refits]:
         recorded = as_recorded(state.study, trial.fitted.model)
         if recorded is not state.study:
-            study = replace(state.study, numerics=recorded.numerics)
-            study, fitted = robust_refit(study, refit(study, state.fitted.model), 1)
-            return replace(state, study=study, fitted=fitted).spent(fitted.evaluations)
+            return _in_steps(state, recorded.numerics, state.fitted.model)
     return None
 
 
-def _in_own_steps(state: State, library: Library, rules: Selection, progress: Progress) -> State | None:
-    """What is found in the model file's own steps, if that is no more and leaves nothing; else None."""
-    own = own_steps(state.study)
+def _in_own_steps(state: State, library: Library, rules: Selection, progress: Progress) -> State:
+    """What is found in the model file's own steps, if that is no more and leaves nothing; else the state as it is."""
+    own, declared = own_steps(state.study), state.first.model
     if own is None:
-        return None
-    study = replace(state.study, numerics=own)
-    declared = state.first.model
-    study, fitted = robust_refit(study, refit(study, declared.at(declared.terms.begin)), 1)
-    plain = replace(state, study=study, fitted=fitted, evidence=(), steps=state.steps[:1]).spent(fitted.evaluations)
-    found = search(plain, library, replace(rules, rounds=OWN_STEPS_FROM - 1), progress)
-    return found if at_floor(rules, found.fitted) else None
+        return state
+    plain = replace(state, evidence=(), steps=state.steps[:1])
+    there = _in_steps(plain, own, declared.at(declared.terms.begin))
+    found = search(there, library, replace(rules, rounds=OWN_STEPS_FROM - 1), progress)
+    return found if at_floor(rules, found.fitted) else state.spent(found.replays - state.replays)
+
+
+def _in_steps(state: State, numerics: Numerics, model: Model) -> State:
+    """The state in other steps, with a model that is fitted again."""
+    study = replace(state.study, numerics=numerics)
+    study, fitted = robust_refit(study, refit(study, model), 1)
+    return replace(state, study=study, fitted=fitted).spent(fitted.evaluations)
 
 
 def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection) -> State:

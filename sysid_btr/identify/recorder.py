@@ -80,11 +80,14 @@ def _refitted_excess(study: Study, cheap: Numerics, model: Model) -> FloatArray:
 
 
 def own_steps(study: Study) -> Numerics | None:
-    """Those of the model file; None where the logs were not recorded in them, or their noise is larger than a step."""
-    own, others = study.robot.model.opt, list(_other_steps(study))
-    same = (n for n in others if (n.timestep, INTEGRATORS.index(n.integrator)) == (own.timestep, own.integrator))
-    numerics = next(same, None)
-    if numerics is None:
+    """Those of the model file; None where no log can have been recorded in them, or noise hides a step's error."""
+    own = study.robot.model.opt
+    same = (
+        numerics
+        for numerics in _other_steps(study)
+        if (numerics.timestep, INTEGRATORS.index(numerics.integrator)) == (own.timestep, own.integrator)
+    )
+    if (numerics := next(same, None)) is None:
         return None
     problem, plain = shorten(replace(study, inflation={}), SECONDS).train_problem(()), np.zeros((1, 0))
     change = problem.with_numerics(numerics).residuals(plain)[0] - problem.residuals(plain)[0]

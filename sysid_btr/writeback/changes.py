@@ -71,9 +71,10 @@ class Stated:
         group = 0 if len(term.groups) == 1 else term.places.index(place)
         return self.estimates[group * kinds : (group + 1) * kinds]
 
-    def acts_at(self, place: str) -> bool:
-        """Whether a place is one of its own."""
-        return place in self.part.term.places or self.part.term.places == ("robot",)
+
+def acts_at(part: Part, place: str) -> bool:
+    """Whether a place is one of a term's own."""
+    return place in part.term.places or part.term.places == ("robot",)
 
 
 def changes_of(before: mujoco.MjModel, target: Target, estimates: Sequence[tuple[Estimate, ...]]) -> tuple[Change, ...]:
@@ -105,15 +106,15 @@ def _of_kind(kind: Kind, before: mujoco.MjModel, after: mujoco.MjModel, stated: 
         if i is None:
             name, place = _place(after, kind, j)
             if name:
-                by = [s for s in stated if s.structural and s.acts_at(place)]
+                by = [s for s in stated if s.structural and acts_at(s.part, place)]
                 yield _added(kind, name, place, by)
             continue
         for feature in of_kind(kind):
             if not _differ(feature, before, i, after, j):
                 continue
             name, place = _place(after, kind, j)
-            by = [s for s in stated if s.acts_at(place) and s.fields & set(feature.fields)]
-            by = by or [s for s in stated if s.acts_at(place) and s.structural and kind != "option"]
+            by = [s for s in stated if acts_at(s.part, place) and s.fields & set(feature.fields)]
+            by = by or [s for s in stated if acts_at(s.part, place) and s.structural and kind != "option"]
             for attribute, old, new in _values(feature, before, i, after, j):
                 called = [s for s in by if s.part.term.called == attribute]
                 yield _change(kind, name, place, attribute, old, new, called or by, set(feature.fields))

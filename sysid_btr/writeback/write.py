@@ -20,7 +20,7 @@ from sysid_btr.run_folder import MODEL, PARAMS, Folder, make_relative
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
 from sysid_btr.version import __version__
-from sysid_btr.writeback.changes import SOLVER, Change, changes_of, describe, place_of
+from sysid_btr.writeback.changes import SOLVER, Change, acts_at, changes_of, describe, place_of
 from sysid_btr.writeback.features import Kind
 from sysid_btr.writeback.filed import loss_of, of_file, stands_alone
 from sysid_btr.writeback.native import Part
@@ -174,16 +174,15 @@ def _is_mjcf(path: Path) -> bool:
 def _notes(target: Target, changes: Sequence[Change]) -> dict[tuple[Kind, str], str]:
     """Comments before what effects change or add; a declared parameter needs none where it has its own name."""
     notes: dict[tuple[Kind, str], str] = {}
+    places = [place_of(target.model, change) for change in changes]
     for part in target.parts:
         if part.stand_in is None or (part.stand_in is part.term and (part.term.declared or not part.term.kinds)):
             continue
-        for change in changes:
+        for change, place in zip(changes, places, strict=True):
             key = (change.kind, change.name)
             if part.term.called not in change.by or change.attribute in SOLVER or change.kind == "geom":
                 continue
-            place = place_of(target.model, change)
-            elsewhere = place not in part.term.places and part.term.places != ("robot",)
-            if elsewhere and change.kind in ("actuator", "joint"):
+            if change.kind in ("actuator", "joint") and not acts_at(part, place):
                 # another term of that name asks for it
                 continue
             words = describe(part, place)
