@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 
 import mujoco
 import numpy as np
@@ -14,6 +15,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.close import close
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.recorder import as_recorded, own_steps
+from sysid_btr.identify.refit import refit
 from sysid_btr.identify.starting import wanted_start
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
@@ -49,10 +51,18 @@ def stepped(
     return time, command, position, velocity
 
 
-def mujoco_log(integrator: str, timestep: float, skipped: float = 0.0, friction: float = 0.0, gain: float = 1.0) -> Log:
+def mujoco_log(
+    integrator: str,
+    timestep: float,
+    skipped: float = 0.0,
+    friction: float = 0.0,
+    gain: float = 1.0,
+    noise: float = NOISE,
+    seed: int = 2,
+) -> Log:
     """What anybody records who steps the leg in MuJoCo; `skipped` s of it come before the log."""
     time, command, position, _ = stepped(integrator, timestep, 8.0 + skipped, friction, gain)
-    seen = position + np.random.default_rng(2).normal(0, NOISE, position.shape)
+    seen = position + np.random.default_rng(seed).normal(0, noise, position.shape)
     first = round(skipped / PERIOD)
     channels = {}
     for k, joint in enumerate(toys.LEG_JOINTS):
@@ -91,6 +101,15 @@ def test_the_steps_are_found_far_from_the_nominal_gains() -> None:
         assert one.ci95[0] <= truth <= one.ci95[1], one
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_whose_error_noise_hides_are_found_by_the_likelihood(seed: int) -> None:
+    study = make_study(toys.leg(), [mujoco_log("Euler", 0.002, noise=8 * NOISE, seed=seed)])
+    model = Model.of(parse_parameters(["mass:*", "kp:*", "kv:*"], study.robot))
+    assert np.all(refit(study, model).train_columns < 1.2)
+    numerics = as_recorded(study, model).numerics
+    assert (numerics.integrator, numerics.timestep, numerics.recorded) == ("Euler", 0.002, True)
+
+
 def test_one_joints_gain_is_found_beside_those_that_are_fitted_alike() -> None:
     log = mujoco_log("Euler", 0.002, gain=0.7)
     found = close(make_study(toys.leg(), [log]), ("mass:*", *GAINS), effects=("kp", "viscous_damping", "armature"))
@@ -101,12 +120,12 @@ def test_one_joints_gain_is_found_beside_those_that_are_fitted_alike() -> None:
     assert shared.ci95[0] <= 1 <= shared.ci95[1]
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.02, 0.2])
-def test_a_robot_that_lacks_something_is_not_taken_for_a_simulator(damping: float) -> None:
+@pytest.mark.parametrize(("damping", "noise"), [*product((0.0, 0.02, 0.2), (1.0,)), (0.0, 8.0), (0.002, 8.0)])
+def test_a_robot_that_lacks_something_is_not_taken_for_a_simulator(damping: float, noise: float) -> None:
     """Steps of Euler's method resemble damping that is not there."""
     motion = toys.swing(toys.LEG_JOINTS, seconds=6.0)
     shown = toys.run(toys.leg(), motion, (ViscousDamping(("hip", "knee", "ankle")),), [damping] * 3, FINE).position[0]
-    noisy = shown + np.random.default_rng(0).normal(0, NOISE, shown.shape)
+    noisy = shown + np.random.default_rng(0).normal(0, noise * NOISE, shown.shape)
     channels = {f"position.{joint}": noisy[:, k] for k, joint in enumerate(toys.LEG_JOINTS)}
     study = make_study(toys.leg(), [replace(motion, channels={**motion.channels, **channels})])
     model = Model.of(parse_parameters(["kp:*=shared", "kv:*=shared"], study.robot))

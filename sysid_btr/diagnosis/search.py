@@ -190,4 +190,6 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
     study = study.with_initial_states(fitted.model)
     study, fitted = robust_refit(study, fitted, 1)
     state = replace(state, study=study, fitted=fitted, evidence=(*staying, evidence)).spent(spent + fitted.evaluations)
+    if at_floor(rules, fitted) and (recorded := as_recorded(study, fitted.model)) is not study:
+        state = _in_steps(state, recorded.numerics, fitted.model)
     return state.step(added=(str(hypothesis),))

@@ -7,7 +7,7 @@ what is not there would be named for it. In such a log it is part of the robot.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
@@ -35,6 +35,8 @@ FITTED = 4
 """Steps in which parameters are fitted again, those of the model first."""
 TURNS = 2
 """Times that these, and where the replay starts, follow each other."""
+CLEAR = 2 * log(100.0)
+"""Decrease of a sum of squares over the noise by which the model file's own steps are 100 times as likely."""
 FLOOR, CHANCE = 0.1, 3.0
 """Chi2 above 1 of a column in which nothing is left: noise floors are known to a few percent; and standard deviations
 of chance on top. Steps must leave nothing: what is missing beside them is found first, and what they resemble, such as
@@ -42,7 +44,10 @@ damping at every joint in proportion to its gain, is hardly ever as exactly that
 
 
 def as_recorded(study: Study, model: Model) -> Study:
-    """The study in the steps of a MuJoCo that recorded it, where a model moves as the log does in these alone."""
+    """The study in the steps of a MuJoCo that recorded it, where a model moves as the log does in these alone.
+
+    Where it does in both, as far as chi2 tells, the likelihood decides on the model file's own steps.
+    """
     others, own = list(_other_steps(study)), float(study.robot.model.opt.timestep)
     if not others:
         return study
@@ -53,41 +58,70 @@ def as_recorded(study: Study, model: Model) -> Study:
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
     jacobian = np.nan_to_num(jacobian)
     now = _excess(problem, residual - explained_by(jacobian, residual))
-    if not _is_above(now):
-        return study
-    seen = {}
-    for numerics in others:
+    seen: dict[Numerics, float] = {}
+    for numerics in others if _is_above(now) else ():
         moved = problem.with_numerics(numerics).residuals(model.values[None])[0]
         if np.isfinite(moved).all():
             there = _excess(problem, moved - explained_by(jacobian, moved))
             if not _is_above(there) or _mean(there) < _mean(now) - HALF:
                 seen[numerics] = _mean(there)
-    likely = sorted(seen, key=lambda n: (n.timestep != own, seen[n]))
-    left = {n: _refitted_excess(replace(short, numerics=n), n, model) for n in likely[:FITTED]}
-    alike = [n for n in left if not _is_above(left[n])]
-    if not alike or not _is_above(_refitted_excess(short, study.cheap, model)):
+    file = _of_the_file(study)
+    # derivatives reach too short for the steps of another: those of the file are the likeliest
+    if file is not None and (seen or (not _is_above(now) and _shows(problem, file, model, residual, jacobian))):
+        seen.setdefault(file, _mean(now))
+    likely = sorted(seen, key=lambda n: (n.timestep != own, seen[n]))[:FITTED]
+    left = {n: _refitted(replace(short, numerics=n), n, model) for n in likely}
+    alike = [n for n in left if not _is_above(left[n].excess)]
+    if not alike:
         return study
-    return replace(study, numerics=min(alike, key=lambda n: (n.timestep != own, _mean(left[n]))))
+    here = _refitted(short, study.cheap, model)
+    if not _is_above(here.excess):
+        alike = [n for n in alike if n == file and left[n].square < here.square - CLEAR]
+    best = min(alike, key=lambda n: (n.timestep != own, _mean(left[n].excess)), default=study.numerics)
+    return study if best == study.numerics else replace(study, numerics=best)
 
 
-def _refitted_excess(study: Study, cheap: Numerics, model: Model) -> FloatArray:
-    """The excess once the parameters, and where the replay starts, have followed."""
+def _shows(
+    problem: ReplayProblem, numerics: Numerics, model: Model, residual: FloatArray, jacobian: FloatArray
+) -> bool:
+    """Whether parameters cannot do what other steps change, as far as a likelihood tells."""
+    change = problem.with_numerics(numerics).residuals(model.values[None])[0] - residual
+    change = change - explained_by(jacobian, change)
+    return bool(change @ change > CLEAR)
+
+
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """What steps leave once parameters have followed: by column, and the sum of squares over the noise."""
+
+    excess: FloatArray
+    square: float
+
+
+def _refitted(study: Study, cheap: Numerics, model: Model) -> _Left:
+    """What is left once the parameters, and where the replay starts, have followed."""
     for _ in range(TURNS):
         _, model = nearby(study, cheap, model)
         study = study.with_initial_states(model, held_out=False)
     problem = study.train_problem(model)
-    return _excess(problem, problem.residuals(model.values[None])[0])
+    residual = problem.residuals(model.values[None])[0]
+    return _Left(_excess(problem, residual), float(residual @ residual))
 
 
-def own_steps(study: Study) -> Numerics | None:
-    """Those of the model file; None where no log can have been recorded in them, or noise hides a step's error."""
+def _of_the_file(study: Study) -> Numerics | None:
+    """The steps of the model file; None where no log can have been recorded in them."""
     own = study.robot.model.opt
     same = (
         numerics
         for numerics in _other_steps(study)
         if (numerics.timestep, INTEGRATORS.index(numerics.integrator)) == (own.timestep, own.integrator)
     )
-    if (numerics := next(same, None)) is None:
+    return next(same, None)
+
+
+def own_steps(study: Study) -> Numerics | None:
+    """Those of the model file; None where no log can have been recorded in them, or noise hides a step's error."""
+    if (numerics := _of_the_file(study)) is None:
         return None
     problem, plain = shorten(replace(study, inflation={}), SECONDS).train_problem(()), np.zeros((1, 0))
     change = problem.with_numerics(numerics).residuals(plain)[0] - problem.residuals(plain)[0]
