@@ -15,6 +15,7 @@ from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.trials import Tried
 from sysid_btr.errors import SysidError
 from sysid_btr.estimators.base import Progress, silent
+from sysid_btr.io._text import some
 from sysid_btr.models.robot import Robot
 from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import Folder
@@ -107,16 +108,18 @@ def _look(
     if not joining.terms or closing.verdict not in EXPLAINING:
         return Joined(closing.message, simulations=spent), None
     fitted = [(term, closing.model.own(term) if term in seen.terms else own) for term, own in declared.parts]
-    added = "; ".join(f"{m.called} at {len(m.places)} places: {_amounts(m, v)}" for m, v in joining.parts)
+    added = "; ".join(f"{m.called} at {some(m.places, 4)}: {_amounts(m, v)}" for m, v in joining.parts)
     return Joined(f"added to the model: {added}", Model.joined([*fitted, *joining.parts]), spent), study
 
 
 def _amounts(term: Term, values: FloatArray) -> str:
     """Values in words: each kind's, and where it has several places their range."""
     own = np.reshape(values, (-1, len(term.numbers)))
-    units = [p.unit for p in term.parameters]
+    units = [
+        " x nominal" if p.unit == "1" and p.nominal == 1 else f" {p.unit}" * (p.unit != "1") for p in term.parameters
+    ]
     return ", ".join(
-        f"{low:.3g} {unit}" if low == high else f"{low:.3g} to {high:.3g} {unit}"
+        f"{low:.3g}{unit}" if low == high else f"{low:.3g} to {high:.3g}{unit}"
         for low, high, unit in zip(own.min(axis=0), own.max(axis=0), units, strict=False)
     )
 

@@ -48,7 +48,8 @@ def _left(before: Scores, after: Scores, channel: str) -> str:
 
 def _amount(estimate: Estimate, kind: str, label: bool) -> str:
     half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    factor = estimate.unit == "1" and estimate.nominal == 1
+    unit = " x nominal" if factor else "" if estimate.unit == "1" else f" {estimate.unit}"
     text = f"{with_digits_of(estimate.value, half)} +- {with_digits_of(half, half)}{unit}"
     return f"{kind} {text}" if label else text
 

@@ -36,7 +36,7 @@ class FootFriction(Effect):
     name: ClassVar[str] = "foot_friction"
     family: ClassVar[str] = "contact"
     field: ClassVar[str] = "foot_friction"
-    title: ClassVar[str] = "change of the ground's friction"
+    title: ClassVar[str] = "a change of the ground's friction"
     scope: ClassVar[Scope] = "robot"
     declared_at: ClassVar[Scope | None] = "body"
     needs: ClassVar[str] = GROUND
@@ -80,7 +80,7 @@ class FootCompliance(Effect):
 
     name: ClassVar[str] = "foot_compliance"
     family: ClassVar[str] = "contact"
-    title: ClassVar[str] = "change of the ground's softness"
+    title: ClassVar[str] = "a change of the ground's softness"
     scope: ClassVar[Scope] = "robot"
     declared_at: ClassVar[Scope | None] = "body"
     needs: ClassVar[str] = GROUND

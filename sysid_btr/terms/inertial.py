@@ -35,7 +35,7 @@ class Mass(Effect):
     """
 
     name: ClassVar[str] = "mass"
-    title: ClassVar[str] = "change of the mass"
+    title: ClassVar[str] = "a change of the mass"
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
@@ -60,7 +60,7 @@ class Inertia(Effect):
     """
 
     name: ClassVar[str] = "inertia"
-    title: ClassVar[str] = "change of the inertia"
+    title: ClassVar[str] = "a change of the inertia"
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("armature", "motion of the body about several axes"),)

@@ -33,7 +33,7 @@ class Kp(Effect):
 
     name: ClassVar[str] = "kp"
     family: ClassVar[str] = "gain"
-    title: ClassVar[str] = "change of the servo's stiffness"
+    title: ClassVar[str] = "a change of the servo's stiffness"
     signed: ClassVar[bool] = True
     everywhere: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
@@ -59,7 +59,7 @@ class Kv(Effect):
     """
 
     name: ClassVar[str] = "kv"
-    title: ClassVar[str] = "change of the servo's damping"
+    title: ClassVar[str] = "a change of the servo's damping"
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
@@ -87,7 +87,7 @@ class TorqueConstant(Effect):
     """
 
     name: ClassVar[str] = "torque_constant"
-    title: ClassVar[str] = "change of the servo's torque"
+    title: ClassVar[str] = "a change of the servo's torque"
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
