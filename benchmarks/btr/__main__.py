@@ -88,15 +88,18 @@ def run(name: str, method: str, seed: int, plan: Plan, out: Path) -> None:
     done.write_text(to_json({**found, "trials": trials, "cpu_s": cpu, "learnt": learnt}))
 
 
-def truth_of(name: str, truth: Truth) -> float:
-    """What a declared parameter is on the robot: the mean over its places, payloads included."""
+def truth_of(name: str, truth: Truth) -> float | None:
+    """What a parameter is on the robot: of most of its joints, in the mean over its bodies; None if this cannot say."""
     term, _, where = name.partition(":")
     if term == "command_delay":
         return truth.delay
     if term in ("kp", "kv"):
         own = getattr(truth, term)
-        return float(np.mean([own.get(j, 1.0) for j in SPACE.joints])) * (truth.gain if term == "kp" else 1.0)
-    bodies = [b for b in BODIES if fnmatchcase(b, where)]
+        factors = [own.get(j, 1.0) for j in SPACE.joints if fnmatchcase(j, where)]
+        return float(np.median(factors)) * (truth.gain if term == "kp" and where == "*" else 1.0)
+    bodies = [b for b in BODIES if fnmatchcase(b, where)] if term == "mass" else []
+    if not bodies:
+        return None
     nominal = {b: float(NAO.model.body(b).mass[0]) for b in bodies}
     return float(np.mean([truth.mass.get(b, 1.0) + truth.payload.get(b, (0.0, ()))[0] / nominal[b] for b in bodies]))
 

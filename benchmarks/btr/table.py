@@ -105,7 +105,8 @@ def show(summary: Mapping[str, Any]) -> str:
         fell = "" if falls is None else f", {falls:.0%} after the first iteration"
         lines.append(f"{name}: {m['runs']} runs, {m['fell']:.0%} of trials fell{fell}; median best {best}{held}")
     for r in summary["runs"]:
-        known = [low <= truth <= high for _, low, high, truth in r.get("learnt", {}).values()]
+        learnt = r.get("learnt", {}).values()
+        known = [low <= truth <= high for _, low, high, truth in learnt if truth is not None]
         if known:
             lines.append(f"{r['robot']} {r['seed']}: {sum(known)} of {len(known)} 95 % intervals hold the truth")
     for name, ahead in summary["ahead_after_10_of_others_at_the_end"].items():

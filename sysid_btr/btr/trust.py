@@ -1,8 +1,4 @@
-"""How far from what has worked a controller may lie: steps grow with success and shrink after falls.
-
-As in a trust region (Conn, Gould and Toint 2000, doi:10.1137/1.9780898719857, section 6.1), which is the larger the
-better what was tried went as foreseen.
-"""
+"""How far from what has worked a controller may lie: steps grow with success and shrink after falls."""
 
 from __future__ import annotations
 
@@ -19,9 +15,6 @@ FIRST, LEAST, MOST = 0.2, 0.02, 0.5
 """Half-widths of the region, fractions of the range of every number: at first, at least, at most."""
 GROWS, SHRINKS = 1.1, 0.6
 """By what it grows with a trial that stood, and shrinks after one that did not: it stays where one of six falls."""
-FORESEEN, GROWS_FAST, LOST = 0.9, 1.5, 0.5
-"""Share of the expected fitness, or its inverse, from which a trial went as foreseen, and by what the region grows with
-it; share below which a model is no guide there, so that the region shrinks although the robot stood."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +42,10 @@ class Region:
             return cls(lower, upper)
         radius, began = FIRST, False
         for t in tried:
-            began = began or t.trial.outcome == "done"
+            up = t.trial.outcome == "done"
+            began = began or up
             if began:
-                radius = float(np.clip(radius * _factor(t), LEAST, MOST))
+                radius = float(np.clip(radius * (GROWS if up else SHRINKS), LEAST, MOST))
         centre = max(stood, key=lambda t: t.trial.fitness).controller.values
         reach = radius * (upper - lower)
         return cls(np.maximum(lower, centre - reach), np.minimum(upper, centre + reach), centre, radius)
@@ -60,11 +54,3 @@ class Region:
         """(n,) whether controllers (n, p) lie in it."""
         slack = 1e-9 * (self.upper - self.lower)
         return np.asarray(((controllers >= self.lower - slack) & (controllers <= self.upper + slack)).all(axis=1))
-
-
-def _factor(tried: Tried) -> float:
-    """By what a trial widens the region."""
-    real, expected = tried.trial.fitness, tried.expected
-    if tried.trial.outcome != "done" or real < LOST * expected:
-        return SHRINKS
-    return GROWS_FAST if FORESEEN * expected <= real <= expected / FORESEEN else GROWS
