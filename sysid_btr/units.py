@@ -54,3 +54,10 @@ def probability(value: float) -> str:
     if value > 0.995:
         return "over 99 %"
     return "under 1 %" if value < 0.005 else f"{100 * value:.0f} %"
+
+
+def after_number(unit: str, nominal: float) -> str:
+    """What follows a number of this unit in a sentence: of a factor that is 1 in the plain model, of what it is one."""
+    if unit == "1":
+        return " x nominal" if nominal == 1 else ""
+    return f" {unit}"

@@ -138,10 +138,10 @@ class OnTheRobot:
 def repertoire(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[dict[str, Any]]:
     """Intelligent Trial and Error (Cully et al. 2015, doi:10.1038/nature14422).
 
-    MAP-Elites fills a repertoire of gaits, as many simulations in the nominal model as the loop has in drawn ones, the
-    fastest gait of each cell of a centroidal Voronoi tessellation of the space of gaits. Of these the one with the
-    highest upper confidence bound is tried, by a Gaussian process about the model's speed with the authors' kernel
-    (Matern 5/2), noise (0.001) and weight of the deviation (0.05).
+    MAP-Elites fills a repertoire of gaits, the fastest of each cell of a centroidal Voronoi tessellation of their
+    space, with a simulation of the nominal model for each drawn model in which the loop may run a candidate. Of these
+    the one with the highest upper confidence bound is tried, by a Gaussian process about the model's speed with the
+    authors' kernel (Matern 5/2), noise (0.001) and weight of the deviation (0.05).
     """
     from ribs.archives import CVTArchive
     from ribs.emitters import IsoLineEmitter
@@ -150,31 +150,31 @@ def repertoire(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[d
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
     stage, p = Stage(make_world(NAO, TASK, (), threads=1), TASK, SPACE), len(SPACE.names)
-    unit = [(0.0, 1.0)] * p
+    unit, width = [(0.0, 1.0)] * p, SPACE.upper - SPACE.lower
     archive = CVTArchive(solution_dim=p, centroids=CELLS, ranges=unit, seed=seed)
-    first = (SPACE.start - SPACE.lower) / (SPACE.upper - SPACE.lower)
+    first = (SPACE.start - SPACE.lower) / width
     emitter = IsoLineEmitter(archive, x0=first, bounds=unit, batch_size=plan.search.population, seed=seed)
     scheduler = Scheduler(archive, [emitter])
     for _ in range(plan.draws * plan.generations * plan.iterations):
         asked = scheduler.ask()
-        fitness, fell = stage.outcomes(SPACE.lower + asked * (SPACE.upper - SPACE.lower), np.zeros((1, 0)))
+        fitness, fell = stage.outcomes(SPACE.lower + asked * width, np.zeros((1, 0)))
         scheduler.tell(np.where(fell | ~np.isfinite(fitness), 0.0, fitness)[0], asked)
     gaits, foreseen = archive.data(["solution", "objective"], return_type="tuple")
-    unit_speed = float(np.abs(foreseen).max())
+    fastest = float(np.abs(foreseen).max())
     kernel = ConstantKernel(1.0, "fixed") * Matern(0.4, "fixed", nu=2.5)
     process = GaussianProcessRegressor(kernel, alpha=0.001, optimizer=None)
     found, tried, off = [], list[int](), list[float]()
     for _ in range(plan.count):
-        mean, std = foreseen / unit_speed, np.ones(len(gaits))
+        mean, std = foreseen / fastest, np.ones(len(gaits))
         if tried:
             more, std = process.fit(gaits[tried], np.array(off)).predict(gaits, return_std=True)
             mean = mean + more
         mean[tried] = -np.inf
         row = int(np.argmax(mean + 0.05 * std))
-        trial = robot.run(Controller(SPACE.lower + gaits[row] * (SPACE.upper - SPACE.lower)))
+        trial = robot.run(Controller(SPACE.lower + gaits[row] * width))
         real = trial.fitness if trial.outcome == "done" else 0.0
         tried.append(row)
-        off.append((real - float(foreseen[row])) / unit_speed)
+        off.append((real - float(foreseen[row])) / fastest)
         found.append(shot(trial, None, float(foreseen[row])))
     return found
 

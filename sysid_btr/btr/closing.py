@@ -21,6 +21,7 @@ from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import Folder
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.model import Model
+from sysid_btr.units import after_number
 
 if TYPE_CHECKING:
     from sysid_btr.identify.study import Study
@@ -115,9 +116,7 @@ def _look(
 def _amounts(term: Term, values: FloatArray) -> str:
     """Values in words: each kind's, and where it has several places their range."""
     own = np.reshape(values, (-1, len(term.numbers)))
-    units = [
-        " x nominal" if p.unit == "1" and p.nominal == 1 else f" {p.unit}" * (p.unit != "1") for p in term.parameters
-    ]
+    units = [after_number(p.unit, p.nominal) for p in term.parameters]
     return ", ".join(
         f"{low:.3g}{unit}" if low == high else f"{low:.3g} to {high:.3g}{unit}"
         for low, high, unit in zip(own.min(axis=0), own.max(axis=0), units, strict=False)

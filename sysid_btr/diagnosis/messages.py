@@ -11,7 +11,7 @@ from sysid_btr.diagnosis.closing import NamedEffect, Verdict
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.scores import Scores
 from sysid_btr.terms.effect import Effect
-from sysid_btr.units import probability, si_all, with_digits_of
+from sysid_btr.units import after_number, probability, si_all, with_digits_of
 
 
 def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
@@ -48,8 +48,7 @@ def _left(before: Scores, after: Scores, channel: str) -> str:
 
 def _amount(estimate: Estimate, kind: str, label: bool) -> str:
     half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
-    factor = estimate.unit == "1" and estimate.nominal == 1
-    unit = " x nominal" if factor else "" if estimate.unit == "1" else f" {estimate.unit}"
+    unit = after_number(estimate.unit, estimate.nominal)
     text = f"{with_digits_of(estimate.value, half)} +- {with_digits_of(half, half)}{unit}"
     return f"{kind} {text}" if label else text
 
