@@ -6,7 +6,7 @@ what is not there would be named for it. In such a log it is part of the robot.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
@@ -48,13 +48,29 @@ def as_recorded(study: Study, model: Model) -> Study:
 
     Where it does in both, as far as chi2 tells, the likelihood decides on the model file's own steps.
     """
-    others, own = list(_other_steps(study)), float(study.robot.model.opt.timestep)
+    others = tuple(_other_steps(study))
     if not others:
         return study
     short = replace(shorten(study, SECONDS), numerics=study.numerics)
-    problem = short.train_problem(model)
-    if not np.isfinite(problem.residuals(model.values[None])).all():
+    likely = _likely(short, model, others)
+    left = {n: _refitted(replace(short, numerics=n), n, model) for n in likely}
+    alike = [n for n in left if not _is_above(left[n].excess)]
+    if not alike:
         return study
+    here = _refitted(short, study.cheap, model)
+    if not _is_above(here.excess):
+        file = _of_the_file(study, others)
+        alike = [n for n in alike if n == file and left[n].square < here.square - CLEAR]
+    first = _file_first(study)
+    best = min(alike, key=lambda n: first(n, _mean(left[n].excess)), default=study.numerics)
+    return study if best == study.numerics else replace(study, numerics=best)
+
+
+def _likely(study: Study, model: Model, others: Sequence[Numerics]) -> list[Numerics]:
+    """The steps in which a model, to first order, may move as the log does; those of the model file first."""
+    problem = study.train_problem(model)
+    if not np.isfinite(problem.residuals(model.values[None])).all():
+        return []
     residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
     jacobian = np.nan_to_num(jacobian)
     now = _excess(problem, residual - explained_by(jacobian, residual))
@@ -65,20 +81,18 @@ def as_recorded(study: Study, model: Model) -> Study:
             there = _excess(problem, moved - explained_by(jacobian, moved))
             if not _is_above(there) or _mean(there) < _mean(now) - HALF:
                 seen[numerics] = _mean(there)
-    file = _of_the_file(study)
+    file = _of_the_file(study, others)
     # derivatives reach too short for the steps of another: those of the file are the likeliest
     if file is not None and (seen or (not _is_above(now) and _shows(problem, file, model, residual, jacobian))):
         seen.setdefault(file, _mean(now))
-    likely = sorted(seen, key=lambda n: (n.timestep != own, seen[n]))[:FITTED]
-    left = {n: _refitted(replace(short, numerics=n), n, model) for n in likely}
-    alike = [n for n in left if not _is_above(left[n].excess)]
-    if not alike:
-        return study
-    here = _refitted(short, study.cheap, model)
-    if not _is_above(here.excess):
-        alike = [n for n in alike if n == file and left[n].square < here.square - CLEAR]
-    best = min(alike, key=lambda n: (n.timestep != own, _mean(left[n].excess)), default=study.numerics)
-    return study if best == study.numerics else replace(study, numerics=best)
+    first = _file_first(study)
+    return sorted(seen, key=lambda n: first(n, seen[n]))[:FITTED]
+
+
+def _file_first(study: Study) -> Callable[[Numerics, float], tuple[bool, float]]:
+    """Order of steps by what they leave, those as long as the model file's first."""
+    own = float(study.robot.model.opt.timestep)
+    return lambda numerics, left: (numerics.timestep != own, left)
 
 
 def _shows(
@@ -108,12 +122,12 @@ def _refitted(study: Study, cheap: Numerics, model: Model) -> _Left:
     return _Left(_excess(problem, residual), float(residual @ residual))
 
 
-def _of_the_file(study: Study) -> Numerics | None:
-    """The steps of the model file; None where no log can have been recorded in them."""
+def _of_the_file(study: Study, others: Iterable[Numerics]) -> Numerics | None:
+    """Of other steps those of the model file; None where no log can have been recorded in them."""
     own = study.robot.model.opt
     same = (
         numerics
-        for numerics in _other_steps(study)
+        for numerics in others
         if (numerics.timestep, INTEGRATORS.index(numerics.integrator)) == (own.timestep, own.integrator)
     )
     return next(same, None)
@@ -121,7 +135,7 @@ def _of_the_file(study: Study) -> Numerics | None:
 
 def own_steps(study: Study) -> Numerics | None:
     """Those of the model file; None where no log can have been recorded in them, or noise hides a step's error."""
-    if (numerics := _of_the_file(study)) is None:
+    if (numerics := _of_the_file(study, _other_steps(study))) is None:
         return None
     problem, plain = shorten(replace(study, inflation={}), SECONDS).train_problem(()), np.zeros((1, 0))
     change = problem.with_numerics(numerics).residuals(plain)[0] - problem.residuals(plain)[0]
