@@ -61,6 +61,21 @@ def test_falls_that_no_model_foresaw_are_learnt() -> None:
     assert sure.mean() > 0.7
 
 
+def test_falls_where_all_models_agree_say_that_they_are_too_sure() -> None:
+    controllers = np.linspace(0.0, 1.0, 6)[:, None] * np.ones(6)
+
+    def loss_of_faith(models_that_fell: int) -> float:
+        fell = np.zeros((12, 6), dtype=bool)
+        fell[:models_that_fell, :5] = True
+        drawn = Drawn(controllers, np.full((12, 6), 0.05), fell)
+        far, real = drawn.of(np.array([5])), np.zeros(4)
+        never, always = (foresee(far, drawn.of(np.arange(4)), real, np.full(4, up)) for up in (True, False))
+        return float(never.stands[0] - always.stands[0])
+
+    # of a controller that stands in all models and is near to none that was tried
+    assert loss_of_faith(0) > 2 * loss_of_faith(6)
+
+
 def test_an_interval_holds_what_a_fall_leaves() -> None:
     sure = Foresight(np.array([0.05]), np.array([0.001]), np.array([0.999])).of(0)
     risky = Foresight(np.array([0.05]), np.array([0.001]), np.array([0.5])).of(0)
