@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from sysid_btr.btr.belief import Belief
+from sysid_btr.models.builtin import load_robot
 from sysid_btr.terms.base import Parameter
+from sysid_btr.terms.grammar import parse_parameters
 
 
 def parameter(name: str, lower: float, upper: float) -> Parameter:
@@ -74,3 +76,11 @@ def test_what_is_learnt_of_some_parameters_moves_those_that_are_tied_to_them() -
 def test_numbers_that_do_not_belong_to_the_parameters_are_refused() -> None:
     with pytest.raises(ValueError, match="1 parameters"):
         Belief((parameter("a", 0.0, 2.0),), np.ones(2), np.eye(2))
+
+
+def test_gears_are_expected_to_rub_by_half_a_degree_of_a_servo() -> None:
+    nao = load_robot("nao")
+    terms, belief = Belief.unmeasured(nao, parse_parameters(["mass:Torso"], nao), ground=False)
+    std = dict(zip((term.name for term in terms), belief.std, strict=True))
+    assert std["coulomb_friction"] == pytest.approx(0.01 * np.median(nao.model.actuator_gainprm[:, 0]))
+    assert std["command_delay"] == pytest.approx(0.02)

@@ -8,17 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.models.robot import Robot
+from sysid_btr.models.robot import Robot, servo_drives
 from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.effect import GROUND
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
-UNMEASURED: Mapping[str, float] = {"foot_compliance": 0.5, "foot_friction": 0.2, "command_delay": 0.02}
+DRY = "coulomb_friction"
+UNMEASURED: Mapping[str, float] = {"foot_compliance": 0.5, "foot_friction": 0.2, "command_delay": 0.02, DRY: 0.01}
 """What no trial measures by itself, or nobody declares: effect -> standard deviation about its neutral value.
 
 A ground is as soft as nobody knows; grass, carpet and tiles under rubber differ by tens of percent in friction; a bus
-and a servo's own cycle take a few periods of 10 to 20 ms.
+and a servo's own cycle take a few periods of 10 to 20 ms; and gears rub, so that servos stop half a degree off (rad:
+times their stiffness, that is a torque).
 """
 WIDTH = 2.0
 """Standard deviation of a parameter before anything is known, in changes that matter (`Parameter.scale`)."""
@@ -66,7 +68,7 @@ class Belief:
 
     @classmethod
     def unmeasured(cls, robot: Robot, terms: Sequence[Term], ground: bool = True) -> tuple[tuple[Term, ...], Belief]:
-        """What may differ beside the terms of a model, and how much: the ground, and late commands.
+        """What may differ beside the terms of a model, and how much: the ground, late commands, gears that rub.
 
         Parameters
         ----------
@@ -81,7 +83,8 @@ class Belief:
             asked = effect.name in UNMEASURED and (ground or effect.needs != GROUND)
             if asked and effect.name not in there and places:
                 found.append(effect(places=places, shared=len(places) > 1))
-        std = np.array([UNMEASURED[term.name] for term in found for _ in term.parameters])
+        size = {DRY: _stiffness(robot)}
+        std = np.array([UNMEASURED[term.name] * size.get(term.name, 1.0) for term in found for _ in term.parameters])
         listed = Terms(found)
         return tuple(found), cls(listed.parameters, listed.nominal, np.diag(std**2))
 
@@ -149,3 +152,9 @@ class Belief:
             normal[:, i] = ndtri(np.clip(low + even[:, i] * (high - low), 1e-16, 1 - 1e-16))
             result[:, i] = np.clip(middle + normal[:, i] * root[i, i], lower[i], upper[i])
         return result
+
+
+def _stiffness(robot: Robot) -> float:
+    """Of a servo, Nm/rad: the median of those that the robot has."""
+    gains = [float(robot.model.actuator_gainprm[drive.actuator, 0]) for drive in servo_drives(robot.model)]
+    return float(np.median(gains)) if gains else 1.0

@@ -33,8 +33,9 @@ from sysid_btr.terms.model import Model, Terms
 SECONDS, LOGS = 4.0, 2
 """s from its beginning of a trial that is learnt from, and trials of an iteration: more cost more time than the search
 for gaits."""
-TURNS = 2
-"""Times that states and numbers are found in turn: a third moves numbers by less than a tenth of their deviation."""
+TURNS, SETTLED = 4, 0.05
+"""Times that states and numbers are found in turn, at most; and the change of what is left, as a fraction, below which
+another would move numbers by less than a tenth of their deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,7 @@ def learn(
     model, spent = Model.of(shown, own.mean), 0
     if not np.array_equal(model.values, model.terms.nominal):
         study = study.with_initial_states(model)  # those of a study are the plain model's
-    first = _judged(study, model)
+    first = last = _judged(study, model)
     study = inflate(study, first, memory=True)
     reached: list[tuple[Study, Fitted]] = []
     for _ in range(TURNS):
@@ -144,6 +145,9 @@ def learn(
         found = _judged(study, model)
         study = inflate(study, found, memory=True)
         reached.append((study, found))
+        if abs(found.train / last.train - 1) < SETTLED:
+            break
+        last = found
     study, found = min(reached, key=lambda pair: pair[1].train if np.isfinite(pair[1].train) else np.inf)
     model, explained = found.model, found.train <= study.procedure.tolerated
     if explained:

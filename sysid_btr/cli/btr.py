@@ -32,8 +32,8 @@ DURATIONS, LONG = {"ant": 3.0}, 8.0
 """s of a trial by robot, and of any other."""
 LONGEST = 3600.0
 """s of a trial."""
-DRAWS = 8
-"""Models that controllers are searched in."""
+DRAWS = 12
+"""Models that controllers are searched in: the longer the search, the more it finds what suits these few alone."""
 BY_FITNESS, BY_SENSORS = 12, 2
 """Trials of an iteration where models are judged by fitness, and where by sensors (the paper's m)."""
 
