@@ -378,7 +378,9 @@ def improved() -> BackToReality:
 
 
 LEAST = replace(IMPROVING, models=model_fit(), distance="likelihood")
-LATE = CommandDelay(places=tuple(SPACE.joints), shared=True)
+BESIDE = Terms(Belief.unmeasured(MODEL, (), ground=False)[0])
+"""What is learnt although nobody declared it."""
+LEARNT = [*TRUTH, *(0.01 * BESIDE.scale)]
 
 
 @pytest.mark.parametrize("settings", [LEAST, replace(LEAST, draws=1, choice="fittest")], ids=["drawn", "one model"])
@@ -390,21 +392,21 @@ def test_the_model_is_what_a_likelihood_says_where_that_explains_the_trials(
 
     def learn(kept: Path, robot: RobotModel, trials: list[Trial], known: Terms, belief: Belief, *_: object) -> Learnt:
         asked.append((trials, known.names, belief))
-        found = replace(belief, mean=np.array([*TRUTH, 0.01]), covariance=0.25 * belief.covariance)
+        found = replace(belief, mean=np.array(LEARNT), covariance=0.25 * belief.covariance)
         return Learnt(found if explained else belief, 4.0, 1.0 if explained else 3.9, explained, 10)
 
     monkeypatch.setattr("sysid_btr.btr.loop.learnt_once", learn)
     said: list[str] = []
     outcome = tiny(hidden(), tmp_path, settings, say=said.append)
     assert [len(trials) for trials, *_ in asked] == [2, 2]
-    assert asked[0][1] == ("length:LFFemur", "length:RFTibia", *Terms((LATE,)).names)
+    assert asked[0][1] == ("length:LFFemur", "length:RFTibia", *BESIDE.names)
     # each trial once; what was learnt from those before is what is believed of them
     assert not {id(t) for t in asked[0][0]} & {id(t) for t in asked[1][0]}
     content = outcome.to_dict()
     assert same(tiny(hidden(), tmp_path, settings), outcome)
     if explained:
-        np.testing.assert_array_equal(asked[1][2].mean, [*TRUTH, 0.01])
-        np.testing.assert_array_equal(outcome.model, [*TRUTH, 0.01])
+        np.testing.assert_array_equal(asked[1][2].mean, LEARNT)
+        np.testing.assert_array_equal(outcome.model, LEARNT)
         assert content["parameters"][0]["value"] == TRUTH[0]
         assert content["parameters"][0]["std"] == pytest.approx(0.25 * asked[0][2].std[0])
         assert sum("after correction of the model" in text for text in said) == 2
@@ -433,7 +435,7 @@ def test_what_was_foreseen_is_said_beside_what_happened(improved: BackToReality)
     said: list[str] = []
     tiny(hidden(), settings=replace(IMPROVING, iterations=1), say=said.append)
     result = json.loads(to_json(improved.to_dict()))
-    assert "models that differ in length, command_delay, foot_friction, foot_compliance" in said[0]
+    assert "models that differ in length, coulomb_friction, command_delay, foot_friction, foot_compliance" in said[0]
     for trial, line in zip(result["trials"][:2], said[1:], strict=False):
         foreseen = trial["foreseen"]
         assert foreseen["low"] < foreseen["fitness"] < foreseen["high"]
