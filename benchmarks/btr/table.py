@@ -57,6 +57,8 @@ def row(f: Mapping[str, Any]) -> dict[str, Any]:
         "seed": f["seed"],
         "method": f["method"],
         "trials": len(stood),
+        "draws": f["plan"]["draws"],
+        "generations": f["plan"]["generations"],
         "fell": int(np.sum(~stood)),
         "later": len(stood) - first,
         "fell_later": int(np.sum(~stood[first:])),
