@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -84,3 +85,14 @@ def test_gears_are_expected_to_rub_by_half_a_degree_of_a_servo() -> None:
     std = dict(zip((term.name for term in terms), belief.std, strict=True))
     assert std["coulomb_friction"] == pytest.approx(0.01 * np.median(nao.model.actuator_gainprm[:, 0]))
     assert std["command_delay"] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(("gear", "kp"), [(1, 20.0), (10, 0.2)])
+def test_how_much_gears_rub_is_counted_at_the_joint(gear: int, kp: float, tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody>'
+        f'<actuator><position joint="elbow" gear="{gear}" kp="{kp}"/></actuator></mujoco>'
+    )
+    terms, belief = Belief.unmeasured(load_robot(str(path)), (), ground=False)
+    assert dict(zip((t.name for t in terms), belief.std, strict=True))["coulomb_friction"] == pytest.approx(0.2)

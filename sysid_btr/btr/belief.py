@@ -155,6 +155,10 @@ class Belief:
 
 
 def _stiffness(robot: Robot) -> float:
-    """Of a servo, Nm/rad: the median of those that the robot has."""
-    gains = [float(robot.model.actuator_gainprm[drive.actuator, 0]) for drive in servo_drives(robot.model)]
-    return float(np.median(gains)) if gains else 1.0
+    """Of a servo at its joint, Nm/rad: the median of those that the robot has."""
+    model = robot.model
+    found = [
+        float(model.actuator_gear[drive.actuator, 0] * model.actuator_gainprm[drive.actuator, 0]) * drive.scale
+        for drive in servo_drives(model)
+    ]
+    return float(np.median(found)) if found else 1.0

@@ -89,7 +89,7 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         None,
         "Number of models in which controllers are searched for, drawn from the distribution of the parameters; 1 is "
         "the model alone.",
-        otherwise="8 for the choice improvement, else 1",
+        otherwise=f"{DRAWS} for the choice improvement, else 1",
         metavar="N",
         least=1,
         decides=True,
