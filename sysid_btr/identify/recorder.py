@@ -6,7 +6,7 @@ what is not there would be named for it. In such a log it is part of the robot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
@@ -61,8 +61,7 @@ def as_recorded(study: Study, model: Model) -> Study:
     if not _is_above(here.excess):
         file = _of_the_file(study, others)
         alike = [n for n in alike if n == file and left[n].square < here.square - CLEAR]
-    first = _file_first(study)
-    best = min(alike, key=lambda n: first(n, _mean(left[n].excess)), default=study.numerics)
+    best = min(alike, key=lambda n: _file_first(study, n, _mean(left[n].excess)), default=study.numerics)
     return study if best == study.numerics else replace(study, numerics=best)
 
 
@@ -85,14 +84,12 @@ def _likely(study: Study, model: Model, others: Sequence[Numerics]) -> list[Nume
     # derivatives reach too short for the steps of another: those of the file are the likeliest
     if file is not None and (seen or (not _is_above(now) and _shows(problem, file, model, residual, jacobian))):
         seen.setdefault(file, _mean(now))
-    first = _file_first(study)
-    return sorted(seen, key=lambda n: first(n, seen[n]))[:FITTED]
+    return sorted(seen, key=lambda n: _file_first(study, n, seen[n]))[:FITTED]
 
 
-def _file_first(study: Study) -> Callable[[Numerics, float], tuple[bool, float]]:
-    """Order of steps by what they leave, those as long as the model file's first."""
-    own = float(study.robot.model.opt.timestep)
-    return lambda numerics, left: (numerics.timestep != own, left)
+def _file_first(study: Study, numerics: Numerics, left: float) -> tuple[bool, float]:
+    """Where steps come in the order of what they leave, those as long as the model file's first."""
+    return numerics.timestep != float(study.robot.model.opt.timestep), left
 
 
 def _shows(
