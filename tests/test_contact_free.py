@@ -88,7 +88,7 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
         time=np.arange(n) * 0.02,
         size=replace(NAO, weight=0.01),
     )
-    shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3]
+    shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3, (w, d, joints)]
     known = chain_module.Derivatives(*(0.1 * rng.normal(size=s) for s in shapes))
     ends = chain_module.Ends(1e-3 * rng.normal(size=(w, d)), 1e-3 * rng.normal(size=(w, d, p)))
     found = chain_module.linearise_chain(chain, known, ends)

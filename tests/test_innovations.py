@@ -49,7 +49,7 @@ def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.Monk
         time=np.arange(n) * 0.02,
         size=replace(NAO, weight=0.01),
     )
-    shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3]
+    shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3, (w, d, joints)]
     known = Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
     keep = np.setdiff1d(np.arange(d), chain_module.BLIND)
     sight = chain_module.measurements(chain)[0]
@@ -140,6 +140,36 @@ def test_innovations_are_white_where_joints_stick_and_slip() -> None:
     assert 0.5 < right < 1.4
     assert chi2(begun, 0.2) > 1.5 * right
     assert all(chi2(followed, other) > 1.02 * right for other in (0.1, 0.15, 0.25, 0.3))
+
+
+@pytest.mark.slow
+def test_dry_friction_of_a_walk_is_found_from_none_and_leaves_the_gains_alone() -> None:
+    log = record_walk(Gait(), 4.0, edit=_rough)[0]
+    told = fit(make_study(load_robot("nao"), [log], threads=2), ["coulomb_friction:*=shared", "kp:*=shared"])
+    for estimate, truth in zip(told.estimates, (0.2, 1.0), strict=True):
+        assert abs(estimate.value - truth) < 3 * estimate.std, estimate
+        assert estimate.std < 0.25 * truth, estimate
+    assert told.misfit is None
+
+
+def test_what_a_joint_holds_that_stands_still_is_not_known_and_does_not_depend_on_the_candidate() -> None:
+    log = record_walk(Gait(), 2.0, edit=_rough)[0]
+    begun = make_study(load_robot("nao"), [log], threads=2)
+    terms = begun.declare(["coulomb_friction:*=shared"])
+    episode = begun.with_initial_states(Model(terms, np.array([0.2])), held_out=False).train[0]
+    assert isinstance(episode, InnovationsEpisode)
+    assert episode.chain is not None
+    chain, steps = episode.chain, episode.chain.steps
+    still = steps.still
+    speed = np.abs(chain.states.joint_velocity[:-1])
+    assert np.all(still[speed < 0.05])
+    assert 0.05 < still.mean() < 1.0
+    every = np.arange(len(still))
+    less, more = (
+        steps.ends(np.array([[friction]]), np.zeros(len(every), dtype=np.int64), every, None) for friction in (0.1, 0.3)
+    )
+    same = np.all(less.joint_velocity == more.joint_velocity, axis=1)
+    assert np.array_equal(same, still.all(axis=1))
 
 
 def test_derivatives_are_kept_where_they_foretell_what_a_step_does() -> None:

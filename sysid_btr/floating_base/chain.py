@@ -27,13 +27,16 @@ from sysid_btr.objectives.problem import BLOCK
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.segments import BASE, BaseStates, SegmentReplay, Segments
+from sysid_btr.simulation.setup import Setup, Values
 from sysid_btr.simulation.silence import silenced
+from sysid_btr.terms.model import Terms
 
 if TYPE_CHECKING:
     import mujoco
 
     from sysid_btr.terms.base import BatchModel, Fields, JointAddresses, Term
 
+FRICTION = "dof_frictionloss"
 COARSE = 0.004
 """s, longest step of the fourth-order integrator."""
 ROUGH, ROUGH_ERROR, CHECKED = 0.010, 0.05, 16
@@ -64,6 +67,10 @@ STALE = 0.2
 """Error of a change of state that derivatives may predict, fractions of `NUDGE`."""
 NUDGE_NUMBER = 0.02
 """Changes of the numbers by which derivatives are taken, fractions of their ranges."""
+HOLD = 5.0
+"""Standard deviation of what a joint that may stand still holds beside its friction's own law, as torque over a sample
+and a multiple of the friction that it may have: a stop of so many samples squared (0.25 s at 100 Hz) under all of it
+counts as one deviation."""
 LATE = 0.001
 """s, standard deviation of what sensors and commands may be apart in time beyond the model: a tick of a loop at 1 kHz.
 A gain and a fraction of a millisecond look much alike. Of the bus, whatever the size of the robot."""
@@ -81,10 +88,13 @@ class SampleSteps(FloatingReplay):
     ----------
     wrench : (w, f, 6) force (N) and torque (Nm), in the world's axes, on the centre of mass of each foot.
     late : steps of the integrator by which commands come later than the log has them.
+    friction : (j,) dry friction, Nm, of joints while they may stand still, whatever candidates say: a joint that stands
+        holds any torque up to it, and does not show it. None: that of the candidate, always.
     """
 
     wrench: FloatArray | None = None
     late: int = 0
+    friction: FloatArray | None = None
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -118,6 +128,23 @@ class SampleSteps(FloatingReplay):
         pushed[:, self.feet] = wrench
         return {"xfrc_applied": pushed}
 
+    @cached_property
+    def still(self) -> BoolArray:
+        """(w, j) whether a joint may stand still in a step: it begins or ends so slowly, or turns round."""
+        assert self.base is not None
+        first = self._segments.joint_velocity
+        last = np.concatenate([first[1:], first[-1:]])
+        slowest = np.minimum(np.abs(first), np.abs(last)) * (np.sign(first) == np.sign(last))
+        return np.asarray(slowest <= self.base.size.state(NUDGE)[5])
+
+    def _setup(self, pairs: Values, segment: IntArray, change: FloatArray | None, steps: int) -> Setup:
+        setup = super()._setup(pairs, segment, change, steps)
+        if self.friction is not None:
+            friction, dof = setup.batch.read(FRICTION), self.index.dof
+            friction[:, dof] = np.where(self.still[segment], self.friction, friction[:, dof])
+            setup.batch.write({FRICTION: friction})
+        return setup
+
     def ends(self, candidates: FloatArray, row: IntArray, segment: IntArray, change: FloatArray | None) -> Segments:
         """States at the ends of steps: of candidate `row`, in step `segment`, from a start with a `change`."""
         size, j = len(row), len(self.index.joints)
@@ -137,12 +164,16 @@ class SampleSteps(FloatingReplay):
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Of the end of each step: by its start (w, d, d), by the mean wrench and by blows at its start and its end."""
+    """Of the end of each step: by its start (w, d, d), by the mean wrench and by blows at its start and its end.
+
+    These are (w, d, 6 f) each; those of blows on the joints at its start are (w, d, j).
+    """
 
     start: FloatArray
     mean: FloatArray
     blow: FloatArray
     last: FloatArray
+    joint: FloatArray
 
     def renewed(self, which: BoolArray, found: Derivatives) -> Derivatives:
         """The same with those of some steps found anew."""
@@ -154,7 +185,7 @@ class Derivatives:
     def part(self, start: int, stop: int) -> Derivatives:
         """Those of the steps between the samples from `start` to before `stop`."""
         own = slice(start, stop - 1)
-        return Derivatives(self.start[own], self.mean[own], self.blow[own], self.last[own])
+        return Derivatives(**{f.name: getattr(self, f.name)[own] for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +203,7 @@ class Chain:
     time : (n,) s since the first sample.
     size : of the robot.
     jolt, slack : one of `JOLTS`, and factor on `SLACK`, one of `SLACKS`.
+    held : (j,) size, Nms, of the unknown blow in a step in which a joint may stand still; None where nothing rubs.
     """
 
     steps: SampleSteps
@@ -184,6 +216,7 @@ class Chain:
     size: BodySize
     jolt: float = JOLTS[2]
     slack: float = 1.0
+    held: FloatArray | None = None
 
     def part(self, start: int, stop: int) -> Chain:
         """The chain of the samples from `start` to before `stop`."""
@@ -360,7 +393,9 @@ def derive(chain: Chain, values: FloatArray, which: IntArray | None = None) -> D
     mean = np.moveaxis(found[:, len(felt) :], 1, 2) / kinds
     on = np.repeat(chain.touch[which], 6, axis=1)[:, None]
     first, last = (_blows(chain, values, samples) for samples in (which, 1 + which))
-    return Derivatives(start, mean * on, start @ first * on, last * on)
+    feet = on.shape[2]
+    first = start @ first
+    return Derivatives(start, mean * on, first[:, :, :feet] * on, last[:, :, :feet] * on, first[:, :, feet:])
 
 
 def stale(chain: Chain, known: Derivatives, values: FloatArray, number: int) -> BoolArray:
@@ -409,6 +444,20 @@ def _responses(chain: Chain, steps: SampleSteps, values: FloatArray, which: IntA
     return result
 
 
+def with_friction(chain: Chain, values: FloatArray) -> Chain:
+    """The chain with joints that may stand still as they rub under a candidate, and hold what nobody knows.
+
+    What they may rub is a scale of the numbers more, so that a joint which does not yet rub can come to.
+    """
+    terms, dof = Terms(chain.steps.terms), chain.steps.index.dof
+    more = np.minimum(values + terms.scale, terms.upper)
+    friction, most = (_written(chain.steps, v).read(FRICTION)[0, dof] for v in (values, more))
+    if not most.any():
+        return replace(chain, steps=replace(chain.steps, friction=None), held=None)
+    held = HOLD * float(chain.time[1]) * most
+    return replace(chain, steps=replace(chain.steps, friction=friction), held=held)
+
+
 def _stepped(chain: Chain, longest: float) -> SampleSteps:
     """Steps of a sample with a step of the fourth-order integrator that divides it."""
     step = whole_step(float(chain.time[1]), chain.size.time(longest))
@@ -416,7 +465,7 @@ def _stepped(chain: Chain, longest: float) -> SampleSteps:
 
 
 def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
-    """Change of the states at some samples under unit blows (Ns, Nms) on the feet, (k, d, 6 f)."""
+    """Change of the states at some samples under unit blows (Ns, Nms) on the feet and the joints, (k, d, 6 f + j)."""
     import mujoco
 
     steps, states = chain.steps, chain.states
@@ -426,7 +475,9 @@ def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
     order = np.concatenate([motion + np.arange(6), index.dof])
     joints = len(index.joints)
     rows = np.concatenate([np.arange(6, BASE), BASE + joints + np.arange(joints)])
-    jacobian, blow = np.zeros((len(steps.feet), 6, model.nv)), np.zeros((6 * len(steps.feet), model.nv))
+    where = np.zeros((6 * len(steps.feet) + joints, model.nv))
+    where[6 * len(steps.feet) + np.arange(joints), index.dof] = 1.0
+    jacobian, blow = where[: 6 * len(steps.feet)].reshape(-1, 6, model.nv), np.zeros_like(where)
     result = np.zeros((len(samples), states.std.shape[1], len(blow)))
     for own_result, k in zip(result, samples, strict=True):
         data.qpos[place : place + 3] = states.free_base.position[k]
@@ -435,7 +486,7 @@ def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
         mujoco.mj_fwdPosition(model, data)
         for own, body in zip(jacobian, steps.feet, strict=True):
             mujoco.mj_jacBodyCom(model, data, own[:3], own[3:], body)
-        mujoco.mj_solveM(model, data, blow, jacobian.reshape(blow.shape))
+        mujoco.mj_solveM(model, data, blow, where)
         own_result[rows] = blow.T[order]
     return result
 
@@ -535,12 +586,17 @@ def linearise_chain(chain: Chain, known: Derivatives, ends: Ends) -> Round:
 
 
 def unexplained(chain: Chain, known: Derivatives) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sizes of the unknown forces (18 f,), what one of its size does (w, d, 18 f), and the covariance of their sum."""
+    """Sizes of the unknown forces (18 f,), what one of its size does (w, d, 18 f), and the covariance of their sum.
+
+    What joints hold that may stand still comes after the forces, (w, d, 18 f + j).
+    """
     size = chain.size
     kinds = np.tile([1.0] * 3 + [size.length(LEVER)] * 3, chain.touch.shape[1])
     jolt = size.time(chain.jolt) * kinds
     sizes = np.concatenate([STEADY * kinds, jolt, jolt]) * size.weight
     forces = np.concatenate([known.mean, known.blow, known.last], axis=2) * sizes
+    if chain.held is not None:
+        forces = np.concatenate([forces, known.joint * (chain.held * chain.steps.still)[:, None]], axis=2)
     return sizes, forces, forces @ forces.transpose(0, 2, 1) + np.diag((chain.slack * each_of(SLACK, chain)) ** 2)
 
 
@@ -587,7 +643,8 @@ def moved_chain(chain: Chain, known: Derivatives, found: Round, change: FloatArr
     linked = chain.linked[:, None, None]
     forces, total = np.where(linked, forces, 0.0), np.where(linked, total, np.eye(d))
     rest = np.where(linked[:, :, 0], rest, 0.0)
-    pushed = -np.einsum("ndm,nd->nm", forces, np.linalg.solve(total, rest[:, :, None])[:, :, 0]) * sizes
+    own = forces[:, :, : len(sizes)]
+    pushed = -np.einsum("ndm,nd->nm", own, np.linalg.solve(total, rest[:, :, None])[:, :, 0]) * sizes
     wrench = chain.steps.wrench
     assert wrench is not None
     mean = pushed[:, : wrench[0].size].reshape(wrench.shape)

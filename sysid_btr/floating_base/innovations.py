@@ -43,6 +43,7 @@ from sysid_btr.floating_base.chain import (
     simulate_chain,
     stale,
     unexplained,
+    with_friction,
 )
 from sysid_btr.floating_base.episode import MOST_WALKED, reconstruct
 from sysid_btr.floating_base.estimate import BaseState
@@ -185,9 +186,10 @@ def kalman_filter(chain: Chain, known: Derivatives, late: FloatArray) -> Filter:
     late : (n - 1, d) derivative of the ends of steps by the time that commands come later.
     """
     n, j = chain.states.joint_position.shape
-    _, forces, unknown = unexplained(chain, known)
+    sizes, forces, unknown = unexplained(chain, known)
     noise = _without_base(np.delete(unknown, BLIND, axis=1))
-    steady = np.delete(forces[:, :, : known.mean.shape[2]], BLIND, axis=1)
+    # what is as good as free: mean forces on the feet, and what joints hold that stand still
+    steady = np.delete(np.delete(forces, np.s_[known.mean.shape[2] : len(sizes)], axis=2), BLIND, axis=1)
     start = _without_base(np.delete(known.start, BLIND, axis=1))
     sight, left = measurements(chain)
     sight = _without_base(sight)
@@ -355,7 +357,16 @@ class InnovationsEpisode(Episode):
             return FloatingReplay(robot, log, tuple(terms), numerics, effort, threads, base=base)
         steps = self.chain.part(0, n).steps
         return Foreseen(
-            robot, log, tuple(terms), numerics, effort, threads, segments=steps.segments, base=base, wrench=steps.wrench
+            robot,
+            log,
+            tuple(terms),
+            numerics,
+            effort,
+            threads,
+            segments=steps.segments,
+            base=base,
+            wrench=steps.wrench,
+            friction=steps.friction,
         )
 
     def completed(self, plain: Comparison) -> Comparison:
@@ -403,6 +414,7 @@ class InnovationsEpisode(Episode):
         n = len(self.log)
         chain, known = found.chain.part(0, n), found.known.part(0, n)
         chain = replace(chain, steps=replace(chain.steps, terms=replay.terms, numerics=coarse, threads=replay.threads))
+        chain = with_friction(chain, values)
         with phase("states of the base", 0.1):
             chain, known = follow_states(chain, known, values, ROUNDS)
         return replace(found, chain=chain, known=known, filter=filter_at(chain, known, values))
@@ -415,7 +427,7 @@ class InnovationsEpisode(Episode):
             gains = (f"{g}:*=shared" for g in ("kp", "kv") if servo_joints(robot))
             terms = Terms(parse_parameters(["mass:*", *gains], robot))
             replay = FloatingReplay(robot, self.recording, tuple(terms), numerics, threads=threads, base=self.base)
-            chain = replace(chain_of(replay), slack=SLACKS[-1])
+            chain = with_friction(replace(chain_of(replay), slack=SLACKS[-1]), terms.nominal)
             known = derive(chain, terms.nominal)
             if not np.isfinite(known.start).all():
                 raise ModelError(
