@@ -528,6 +528,14 @@ def test_candidates_are_listed_best_first_with_those_that_did_as_well() -> None:
     assert all(c.confused_with == () for c in worse), "what makes it worse is confused with nothing"
 
 
+@given(st.floats(0.1, 50.0), st.lists(st.floats(0.1, 50.0), min_size=1, max_size=4))
+def test_no_candidate_explains_more_than_there_is(before: float, left: list[float]) -> None:
+    trials = [trial(SIMPLE, fitted([chi2], model=Model.of((SIMPLE(("knee",)),), [0.1]))) for chi2 in left]
+    found = candidates_of(RULES, fitted([before]), trials, None, 1)
+    assert all(c.explained <= 1.0 + 1e-9 for c in found)
+    assert any(c.explained > 0 for c in found) == (min(left) < before)
+
+
 # --- what is to be explained ------------------------------------------------------------------------------------------
 
 

@@ -164,13 +164,16 @@ def is_rival(rules: Selection, winner: Trial, other: Trial) -> bool:
 def candidates_of(
     rules: Selection, before: Fitted, trials: Sequence[Trial], winner: Trial | None, number: int
 ) -> list[Candidate]:
-    """What was weighed in a round, best first, with the fraction of the held-out excess that it removes."""
+    """What was weighed in a round, best first, with the fraction of the held-out excess that it removes.
+
+    That is over the noise floor, or over the least that any leaves: a floor may be taken for too high.
+    """
     ordered = sorted(trials, key=lambda t: t.fitted.misfit)
-    excess = max(before.holdout - 1.0, 1e-9)
+    excess = before.holdout - min([1.0, *(t.fitted.holdout for t in trials if np.isfinite(t.fitted.holdout))])
     result = []
     for trial in ordered:
         effect, fitted = trial.hypothesis.effect, trial.fitted
-        gain = (before.holdout - fitted.holdout) / excess
+        gain = (before.holdout - fitted.holdout) / excess if excess > 0 else 0.0
         alike = (
             other.hypothesis.effect.name
             for other in ordered
