@@ -71,9 +71,9 @@ def test_a_mass_a_gain_and_a_delay_are_learnt_on_a_ground_that_is_not_the_models
     for learnt in (first, second):
         assert learnt.explained
         assert np.all(np.abs(learnt.belief.mean - TRUTH) < 4 * learnt.belief.std)
-    # every trial adds to what is known
+    # every trial adds to what is known; joints may rub, which leaves the torso's mass the least of all
     assert np.all(second.belief.std < first.belief.std)
-    assert np.all(second.belief.std < 0.5 * before().std)
+    assert np.all(second.belief.std < [0.7, 0.5, 0.5, 0.5] * before().std)
     differs = TERMS.nominal != TRUTH
     assert np.all(np.abs(second.belief.mean - TRUTH)[differs] < 0.5 * np.abs(TERMS.nominal - TRUTH)[differs])
     assert np.all(np.abs(second.belief.mean - TRUTH)[~differs] < 0.05 * before().std[~differs])
@@ -82,10 +82,13 @@ def test_a_mass_a_gain_and_a_delay_are_learnt_on_a_ground_that_is_not_the_models
 @pytest.mark.slow
 def test_what_the_model_cannot_explain_does_not_move_it() -> None:
     rubs = CoulombFriction(places=JOINTS), [0.3] * len(JOINTS)
-    learnt = from_trials([robot(rubs).run(Controller(SPACE.start))], before())
+    study = trial_study(NAO, usable_logs([robot(rubs).run(Controller(SPACE.start))]), threads=1)
+    smooth = Terms(term for term in TERMS if not isinstance(term, CoulombFriction))
+    belief = before().of(np.flatnonzero([p in smooth.parameters for p in TERMS.parameters]))
+    learnt = learn(study, smooth, belief, model_fit(), np.random.default_rng(0), silent)
     assert not learnt.explained
-    np.testing.assert_array_equal(learnt.belief.mean, before().mean)
-    np.testing.assert_array_equal(learnt.belief.covariance, before().covariance)
+    np.testing.assert_array_equal(learnt.belief.mean, belief.mean)
+    np.testing.assert_array_equal(learnt.belief.covariance, belief.covariance)
     assert "stays" in str(learnt)
 
 
