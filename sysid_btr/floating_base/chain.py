@@ -29,6 +29,7 @@ from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.segments import BASE, BaseStates, SegmentReplay, Segments
 from sysid_btr.simulation.setup import Setup, Values
 from sysid_btr.simulation.silence import silenced
+from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Terms
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
     from sysid_btr.terms.base import BatchModel, Fields, JointAddresses, Term
 
-FRICTION = "dof_frictionloss"
 COARSE = 0.004
 """s, longest step of the fourth-order integrator."""
 ROUGH, ROUGH_ERROR, CHECKED = 0.010, 0.05, 16
@@ -67,10 +67,12 @@ STALE = 0.2
 """Error of a change of state that derivatives may predict, fractions of `NUDGE`."""
 NUDGE_NUMBER = 0.02
 """Changes of the numbers by which derivatives are taken, fractions of their ranges."""
+FRICTION = CoulombFriction.compiled
 HOLD = 5.0
-"""Standard deviation of what a joint that may stand still holds beside its friction's own law, as torque over a sample
-and a multiple of the friction that it may have: a stop of so many samples squared (0.25 s at 100 Hz) under all of it
-counts as one deviation."""
+"""Standard deviation of the torque over a sample that a joint holds which may stand still, beside what its friction
+makes of it, in multiples of the friction that it may have: `HOLD` squared samples (0.25 s at 100 Hz) under all of that
+count as one deviation. Reasoned, not calibrated.
+"""
 LATE = 0.001
 """s, standard deviation of what sensors and commands may be apart in time beyond the model: a tick of a loop at 1 kHz.
 A gain and a fraction of a millisecond look much alike. Of the bus, whatever the size of the robot."""
@@ -392,9 +394,9 @@ def derive(chain: Chain, values: FloatArray, which: IntArray | None = None) -> D
     start[:, :, felt] = np.moveaxis(found[:, : len(felt)], 1, 2) / size[felt]
     mean = np.moveaxis(found[:, len(felt) :], 1, 2) / kinds
     on = np.repeat(chain.touch[which], 6, axis=1)[:, None]
-    first, last = (_blows(chain, values, samples) for samples in (which, 1 + which))
-    feet = on.shape[2]
-    first = start @ first
+    samples, place = np.unique([which, 1 + which], return_inverse=True)
+    first, last = _blows(chain, values, samples)[place.reshape(2, -1)]
+    first, feet = start @ first, on.shape[2]
     return Derivatives(start, mean * on, first[:, :, :feet] * on, last[:, :, :feet] * on, first[:, :, feet:])
 
 

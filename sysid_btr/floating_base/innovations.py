@@ -188,8 +188,9 @@ def kalman_filter(chain: Chain, known: Derivatives, late: FloatArray) -> Filter:
     n, j = chain.states.joint_position.shape
     sizes, forces, unknown = unexplained(chain, known)
     noise = _without_base(np.delete(unknown, BLIND, axis=1))
-    # what is as good as free: mean forces on the feet, and what joints hold that stand still
-    steady = np.delete(np.delete(forces, np.s_[known.mean.shape[2] : len(sizes)], axis=2), BLIND, axis=1)
+    # what is as good as free: mean forces on the feet, which come first, and what joints hold, which comes last
+    mean, beside = forces[:, :, : known.mean.shape[2]], forces[:, :, len(sizes) :]
+    steady = np.delete(np.concatenate([mean, beside], axis=2), BLIND, axis=1)
     start = _without_base(np.delete(known.start, BLIND, axis=1))
     sight, left = measurements(chain)
     sight = _without_base(sight)
