@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.blind.draw import SAMPLE_LOGS
 from benchmarks.blind.families import judge_families
-from benchmarks.blind.table import NEWER, Row, append, read_rows, write_rows
+from benchmarks.blind.table import Row, append, read_rows, write_rows
 from reference_simulator import forms, load_robot
 from reference_simulator.effects import CommandDelay, Effect
 
@@ -73,21 +73,40 @@ def test_certainties_are_kept_with_whether_the_name_is_right() -> None:
     assert [(g.certainty, right) for g, right in found.named] == [(0.9, True), (0.2, False)]
 
 
+def test_of_one_family_the_least_sure_name_and_what_it_rests_on_are_kept() -> None:
+    sure = name("coulomb_friction", "KneePitch", certainty=0.9, evidence={"family": 0.99, "left": 0.01})
+    less = name("viscous_damping", "KneePitch", certainty=0.6, evidence={"family": 0.7, "left": 0.1})
+    found = judge_families({"verdict": "explained", "effects": [sure, less]}, [KNEE], LEG, effort=False)
+    assert [(g.certainty, g.evidence) for g, _ in found.named] == [(0.6, less["evidence"])]
+
+
 def _row(**values: Any) -> Row:
     numbers = {"series": 0, "number": 1, "seed": 1, "effort": 0, "seconds": 1.0, "replays": 2}
     own = {f.name: numbers.get(f.name, f.name) for f in fields(Row)} | values
     return Row(**own)
 
 
-def test_a_table_without_the_newer_columns_is_read_and_continued(tmp_path: Path) -> None:
+NEWER = [f.name for f in fields(Row) if f.default == ""]
+
+
+@pytest.mark.parametrize("lacking", range(1, len(NEWER) + 1))
+def test_a_table_without_the_newer_columns_is_read_and_continued(lacking: int, tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     write_rows(path, [_row()])
-    old = [",".join(line.split(",")[: -len(NEWER)]) for line in path.read_text().splitlines()]
+    old = [",".join(line.split(",")[:-lacking]) for line in path.read_text().splitlines()]
     path.write_text("\n".join(old) + "\n")
-    assert read_rows(path)[0] == _row(**dict.fromkeys(NEWER, ""))
+    assert read_rows(path)[0] == _row(**dict.fromkeys(NEWER[-lacking:], ""))
     append(path, _row(id="two"))
     assert [r.id for r in read_rows(path)] == ["id", "two"]
-    assert read_rows(path)[1].excess_gone == "excess_gone"
+    assert read_rows(path)[1].evidence == "evidence"
+
+
+@pytest.mark.parametrize("columns", [slice(0, -len(NEWER) - 1), slice(1, None)])
+def test_a_table_of_other_columns_is_refused(columns: slice, tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(",".join([f.name for f in fields(Row)][columns]) + "\n")
+    with pytest.raises(ValueError, match="other columns"):
+        read_rows(path)
 
 
 def test_a_recorded_log_comes_back_with_its_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

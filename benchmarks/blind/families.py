@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -75,12 +75,14 @@ class Guess:
     family, where : as named.
     rivals : families that it may be confused with.
     certainty : that it is right, as stated; nan if it is not.
+    evidence : what that was said from, by name.
     """
 
     family: str
     where: Places
     rivals: Places
     certainty: float
+    evidence: Mapping[str, float] = field(default_factory=dict, compare=False)
 
 
 @dataclass(frozen=True)
@@ -139,8 +141,10 @@ def guesses(entries: Iterable[Mapping[str, Any]]) -> tuple[Guess, ...]:
     result = []
     for family, own in table.items():
         rivals = frozenset(families().get(n, n) for e in own for n in e["confused_with"]) - {family}
-        certainty = min((e["certainty"] for e in own if e.get("certainty") is not None), default=math.nan)
-        result.append(Guess(family, frozenset(p for e in own for p in e["where"]), rivals, certainty))
+        # of several the least sure
+        stated = min((e for e in own if e.get("certainty") is not None), key=lambda e: e["certainty"], default={})
+        certainty, evidence = stated.get("certainty", math.nan), stated.get("evidence", {})
+        result.append(Guess(family, frozenset(p for e in own for p in e["where"]), rivals, certainty, evidence))
     return tuple(g for g in result if g.family not in NAMELESS)
 
 

@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 
 
@@ -42,6 +42,7 @@ class Row:
     families: str = ""
     certainties: str = ""
     excess_gone: str = ""
+    evidence: str = ""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -49,8 +50,6 @@ class Row:
         return self.id, self.recipe, self.code
 
 
-NEWER = ("family_correct", "families", "certainties", "excess_gone")
-"""Columns that older tables do not have."""
 NUMBERS: dict[str, type[int] | type[float]] = {
     "series": int,
     "number": int,
@@ -73,8 +72,10 @@ def read_rows(path: Path) -> list[Row]:
         return []
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
-        expected = [f.name for f in fields(Row)]
-        if list(reader.fieldnames or ()) not in (expected, expected[: -len(NEWER)]):
+        expected, found = [f.name for f in fields(Row)], list(reader.fieldnames or ())
+        # older tables have not the last columns
+        oldest = sum(f.default is MISSING for f in fields(Row))
+        if len(found) < oldest or found != expected[: len(found)]:
             raise ValueError(f"{path} has other columns than {', '.join(expected)}; move it away or give --out")
         return [Row(**{k: NUMBERS.get(k, str)(v) for k, v in line.items()}) for line in reader]  # type: ignore[arg-type]
 
