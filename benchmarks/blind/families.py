@@ -82,7 +82,7 @@ class Guess:
     where: Places
     rivals: Places
     certainty: float
-    evidence: Mapping[str, float] = field(default_factory=dict, compare=False)
+    evidence: Mapping[str, float] = field(compare=False)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.blind.families import FamilyJudgement, Guess, judge_families
+from benchmarks.blind.families import FamilyJudgement, judge_families
 from benchmarks.blind.judge import Context, Judgement, judge, signature_fits
 from benchmarks.blind.recorded import Recorded, recipe_state, record
 from benchmarks.blind.table import Row, append
@@ -125,7 +125,7 @@ def _row(
         families="" if family is None else "; ".join(_placed(g.family, sorted(g.where), "") for g, _ in family.named),
         certainties="" if family is None else _certainties(family),
         excess_gone=_text(_excess_gone(result)),
-        evidence="" if family is None else ";".join(_evidence(g) for g, _ in family.named),
+        evidence="" if family is None else _evidence(family),
     )
 
 
@@ -134,9 +134,9 @@ def _certainties(family: FamilyJudgement) -> str:
     return ";".join(f"{g.certainty:.3f}{'+' if right else '-'}" for g, right in family.named)
 
 
-def _evidence(guess: Guess) -> str:
-    """What a certainty was said from: numbers by name."""
-    return " ".join(f"{name}={value:.4g}" for name, value in guess.evidence.items())
+def _evidence(family: FamilyJudgement) -> str:
+    """Of each name, what its certainty was said from: numbers by name."""
+    return ";".join(" ".join(f"{k}={v:.4g}" for k, v in g.evidence.items()) for g, _ in family.named)
 
 
 def _excess_gone(result: dict[str, Any]) -> float:
