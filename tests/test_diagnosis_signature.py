@@ -181,7 +181,7 @@ def test_pulses_in_the_drive_are_asked_for_only_where_an_effort_could_show_them(
 )
 def test_a_train_gives_the_impulse_of_its_pulses(start: float, duration: float, period: float, step: float) -> None:
     time = step * np.arange(round(3.0 / step) + 1)
-    given_torque = pulses(np.array([[2.0, start, duration, period]]), time)[0]
+    given_torque = pulses(np.array([[2.0, start, duration, period]]), time[None])[0]
     begins = start + period * np.arange(200)
     ends = begins + min(duration, period)
     exact = 2.0 * np.sum(np.clip(np.minimum(ends, time[-1]) - np.minimum(begins, time[-1]), 0, None))

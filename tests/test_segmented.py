@@ -27,6 +27,7 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
+from sysid_btr.terms.disturbance import ExternalDisturbanceTrain
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import TorqueScale
@@ -238,21 +239,22 @@ def test_where_open_loop_holds_segments_give_the_same_answer() -> None:
 
 @pytest.mark.parametrize("jitter", [0.0, 0.4])
 def test_segments_from_the_states_of_a_whole_replay_give_that_replay(jitter: float) -> None:
-    """Commands from long before a segment reach into it, and clocks that jitter share a batch."""
+    """Commands from long before a segment reach into it, pushes keep the log's time, and clocks that jitter share a
+    batch."""
     robot, log = double_pendulum(dry='damping=".05"'), driven(jitter=jitter, seconds=2.0, torque=QUIET)
-    late = CommandDelay(("shoulder",))
+    late, pushed = CommandDelay(("shoulder",)), ExternalDisturbanceTrain(("elbow",))
     late = replace(late, known=tuple(replace(p, upper=0.6) for p in late.parameters))
-    numerics = Numerics("RK4", 0.0025)
-    values = np.array([[0.4], [0.113]])
-    whole = Replay(robot, log, (late,), numerics).predict(values)
+    terms, numerics = (late, pushed), Numerics("RK4", 0.0025)
+    values = np.array([[0.4, 0.1, 0.05, 0.06, 0.31], [0.113, -0.2, 0.25, 0.1, 0.7]])
+    whole = Replay(robot, log, terms, numerics).predict(values)
     rows = np.array([[120, 220], [220, 321], [321, 399]])
     for k, value in enumerate(values):
         first = rows[:, 0]
         rate = np.gradient(whole.velocity[k], log.time, axis=0)[first]
         starts = Segments(rows, whole.position[k, first], whole.velocity[k, first], np.ones((3, 4)), None, rate)
-        segments = SegmentReplay(robot, log, (late,), numerics, segments=starts).predict(values)
+        segments = SegmentReplay(robot, log, terms, numerics, segments=starts).predict(values)
         np.testing.assert_allclose(segments.position[k, 120:399], whole.position[k, 120:399], atol=2e-4)
-        alone = SegmentReplay(robot, log, (late,), numerics, segments=starts.chosen(np.array([1]))).predict(value[None])
+        alone = SegmentReplay(robot, log, terms, numerics, segments=starts.chosen(np.array([1]))).predict(value[None])
         assert np.array_equal(alone.position[0, 220:321], segments.position[k, 220:321])
 
 

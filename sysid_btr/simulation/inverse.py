@@ -166,7 +166,7 @@ class InverseReplay(Replay):
     def _applied(self, batch: BatchModel, pairs: Values) -> FloatArray:
         """Torques (m, n, j) known in advance."""
         motion = self.motion
-        borders = np.append(motion.time, motion.time[-1] + motion.period) - 0.5 * motion.period
+        borders = np.append(motion.time, motion.time[-1] + motion.period)[None] - 0.5 * motion.period
         applied = np.zeros((1, 1, 1))
         for term, values in pairs:
             torque = term.applied_torque(batch, values, borders)

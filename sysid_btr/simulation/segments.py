@@ -321,10 +321,8 @@ class SegmentReplay(Replay):
     ) -> Iterator[tuple[IntArray, Outputs]]:
         """Simulations (candidate, segment, change of its start), in batches; parts have the same sample times."""
         pairs = self._values(candidates)
-        # a torque known in advance is known on the log's clock, so its segments cannot share a batch
-        alone = any(type(term).overrides("applied_torque") for term, _ in pairs)
         order = np.argsort(self._clock[segment], kind="stable")
-        label = segment if alone else np.array([frame.size for frame in self._frames])[segment]
+        label = np.array([frame.size for frame in self._frames])[segment]
         labels, begins = np.unique(label[order], return_index=True)
         for own_label in labels[np.argsort(begins)]:
             members = order[label[order] == own_label]
@@ -388,7 +386,7 @@ class SegmentReplay(Replay):
             self.numerics,
             inputs=lambda: {n: values[rows[:, lead:].T] for n, values in step_inputs(self.log, self.grid).items()},
             effort=self.effort,
-            first=int(first[0]),
+            first=first,
             lead=lead,
             extra=self.grid.extra[rows],
         )

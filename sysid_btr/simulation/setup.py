@@ -111,7 +111,7 @@ def prepare(
     *,
     inputs: Callable[[], dict[str, FloatArray]] = dict,
     effort: bool = False,
-    first: int = 0,
+    first: IntArray | int = 0,
     lead: int = 0,
     extra: FloatArray | None = None,
 ) -> Setup:
@@ -125,7 +125,8 @@ def prepare(
     numerics : with which the model was compiled.
     inputs : gives the measured inputs of the drives, (steps, m) each, where a law asks for them.
     effort : whether the torques of the servos are asked for.
-    first : steps on the clock of the log before the first one, for torques known in advance.
+    first : steps on the clock of the log before the first one, of each candidate (m,) or of all, for torques known in
+        advance.
     lead : commands from before the first step, that reach into it when they are delayed.
     extra : (m, lead + steps, ...) what else was commanded, as `Grid.extra` has it.
     """
@@ -133,11 +134,11 @@ def prepare(
     if extra is not None and extra.shape[-1] > controls:
         command = command + fed_forward(batch, *np.split(extra[..., controls:], 2, axis=-1))
     applied: FloatArray | None = None
-    border_time = batch.timestep * (first + np.arange(command.shape[1] - lead + 1, dtype=np.float64))
+    borders = np.atleast_1d(first)[:, None] + np.arange(command.shape[1] - lead + 1, dtype=np.float64)
     for term, values in pairs:
         term.initial_state(batch, values, qpos, qvel)
         command = term.shape_command(batch, values, command)
-        torque = term.applied_torque(batch, values, border_time)
+        torque = term.applied_torque(batch, values, batch.timestep * borders)
         if torque is not None:
             applied = torque if applied is None else applied + torque
     command = lagged(batch, command)

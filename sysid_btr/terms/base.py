@@ -368,7 +368,10 @@ class Term:
         return command
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
-        """Joint torque known in advance, (m, steps, joints of the log), or None."""
+        """Joint torque known in advance, (m, steps, joints of the log), or None.
+
+        `time` (m or 1, steps + 1) is that of the borders of the steps, s since the first sample of the log.
+        """
         return None
 
     def law_numbers(self, values: FloatArray) -> FloatArray:

@@ -36,7 +36,7 @@ class ConstantForce(Effect):
         return (Kind("torque", "Nm", 0.0, -peak, peak, 0.1 * scale.torque_rms),)
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
-        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
         torque[:, :, batch.index.of(self.places)] = values[:, None, :, 0]
         return torque
 
@@ -80,10 +80,10 @@ class ExternalDisturbance(Effect):
         return replace(self, known=_near(self.parameters, values, len(self.kinds)))
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
-        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
         for place, column in enumerate(batch.index.of(self.places)):
             amount, start, duration = (values[:, place, k, None] for k in range(3))
-            overlap = np.minimum(time[None, 1:], start + duration) - np.maximum(time[None, :-1], start)
+            overlap = np.minimum(time[:, 1:], start + duration) - np.maximum(time[:, :-1], start)
             torque[:, :, column] += amount * np.maximum(overlap, 0.0) / batch.timestep
         return torque
 
@@ -124,7 +124,7 @@ class ExternalDisturbanceTrain(Effect):
         return replace(self, known=_near(self.parameters, values, len(self.kinds)))
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
-        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
+        torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
         for place, column in enumerate(batch.index.of(self.places)):
             torque[:, :, column] += pulses(values[:, place], time)
         return torque
@@ -156,7 +156,7 @@ class DriveDisturbanceTrain(ExternalDisturbanceTrain):
         actuator = batch.index.actuator[batch.index.of(self.places)]
         gains, gears = batch.read("actuator_gainprm"), batch.read("actuator_gear")
         stiffness = gains[:, actuator, 0] * gears[:, actuator, 0] * batch.index.scale[batch.index.of(self.places)]
-        time = batch.timestep * np.arange(command.shape[1] + 1, dtype=np.float64)
+        time = batch.timestep * np.arange(command.shape[1] + 1, dtype=np.float64)[None]
         shaped = np.array(command)
         for place, column in enumerate(batch.index.of(self.places)):
             if actuator[place] >= 0:
@@ -167,7 +167,10 @@ class DriveDisturbanceTrain(ExternalDisturbanceTrain):
 
 
 def pulses(values: FloatArray, time: FloatArray) -> FloatArray:
-    """Mean torque over each step, (m, steps), of trains (m, 4) of torque, start, duration, period."""
+    """Mean torque over each step, (m, steps), of trains (m, 4) of torque, start, duration, period.
+
+    `time` (m or 1, steps + 1) is that of the borders of the steps.
+    """
     amount, start, duration, period = (values[:, k, None] for k in range(4))
     duration = np.minimum(duration, period)
 
@@ -177,8 +180,7 @@ def pulses(values: FloatArray, time: FloatArray) -> FloatArray:
         whole = np.floor(since / period)
         return whole * duration + np.minimum(since - whole * period, duration)
 
-    done = elapsed(time[None])
-    return np.asarray(amount * np.diff(done, axis=1) / np.diff(time))
+    return np.asarray(amount * np.diff(elapsed(time), axis=1) / np.diff(time, axis=1))
 
 
 def _near(parameters: tuple[Parameter, ...], values: FloatArray, kinds: int) -> tuple[Parameter, ...]:

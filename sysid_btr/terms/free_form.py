@@ -412,11 +412,11 @@ class FreeTorqueTime(FreeTorque):
         return 0.0, scale.seconds
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
-        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
-        middle, (low, high) = 0.5 * (time[1:] + time[:-1]), self._bounds
+        torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
+        middle, (low, high) = 0.5 * (time[:, 1:] + time[:, :-1]), self._bounds
         for place, column in enumerate(batch.index.of(self.places)):
             modes = self.modes_at(middle, low[place], high[place])
-            torque[:, :, column] += modal_sum(values[:, None, place], modes[None])
+            torque[:, :, column] += modal_sum(values[:, None, place], modes)
         return torque
 
 
@@ -476,8 +476,8 @@ class FreeTorquePeriodic(FreeTorque):
         return replace(self, known=_near_frequency(self.parameters, values, len(self.kinds), self.ranges[0][1]))
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
-        torque = np.zeros((batch.size, len(time) - 1, len(batch.index.joints)))
-        middle = 0.5 * (time[1:] + time[:-1])
+        torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
+        middle = 0.5 * (time[:, 1:] + time[:, :-1])
         for place, column in enumerate(batch.index.of(self.places)):
             modes = periodic_modes()(np.mod(values[:, place, -1, None] * middle, 1.0))
             torque[:, :, column] += modal_sum(values[:, None, place], modes)
