@@ -8,7 +8,7 @@ from functools import cache
 import mujoco
 import numpy as np
 import pytest
-from toys import PENDULUM, pendulum, robot_from_xml, swing
+from toys import PENDULUM, SCALE, pendulum, robot_from_xml, swing
 
 from sysid_btr.diagnosis.leads import leading_hypotheses
 from sysid_btr.diagnosis.selection import STANDARD
@@ -27,7 +27,8 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
-from sysid_btr.terms.disturbance import ExternalDisturbanceTrain
+from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbanceTrain
+from sysid_btr.terms.free_form import FreeGainTime
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import TorqueScale
@@ -239,13 +240,18 @@ def test_where_open_loop_holds_segments_give_the_same_answer() -> None:
 
 @pytest.mark.parametrize("jitter", [0.0, 0.4])
 def test_segments_from_the_states_of_a_whole_replay_give_that_replay(jitter: float) -> None:
-    """Commands from long before a segment reach into it, pushes keep the log's time, and clocks that jitter share a
-    batch."""
+    """Commands from long before a segment reach into it, pushes and laws keep the log's time, and clocks that jitter
+    share a batch."""
     robot, log = double_pendulum(dry='damping=".05"'), driven(jitter=jitter, seconds=2.0, torque=QUIET)
-    late, pushed = CommandDelay(("shoulder",)), ExternalDisturbanceTrain(("elbow",))
+    scales = dict.fromkeys(JOINTS, replace(SCALE, seconds=2.0))
+    late = CommandDelay(("shoulder",))
+    fading = FreeGainTime.at(("elbow",), scales)
     late = replace(late, known=tuple(replace(p, upper=0.6) for p in late.parameters))
-    terms, numerics = (late, pushed), Numerics("RK4", 0.0025)
-    values = np.array([[0.4, 0.1, 0.05, 0.06, 0.31], [0.113, -0.2, 0.25, 0.1, 0.7]])
+    pushed, jolting = ExternalDisturbanceTrain(("elbow",)), DriveDisturbanceTrain(("shoulder",))
+    terms, numerics = (late, pushed, jolting, fading), Numerics("RK4", 0.0025)
+    gain = np.linspace(0.2, 0.05, len(fading.parameters))
+    pulses = ((0.1, 0.05, 0.06, 0.31), (-0.2, 0.25, 0.1, 0.7))
+    values = np.array([[0.4, *pulses[0], *pulses[1], *gain], [0.113, *pulses[1], *pulses[0], *-gain]])
     whole = Replay(robot, log, terms, numerics).predict(values)
     rows = np.array([[120, 220], [220, 321], [321, 399]])
     for k, value in enumerate(values):

@@ -54,7 +54,7 @@ def compile_model(robot: Robot, log: Log, terms: Sequence[Term], numerics: Numer
     for key in list(spec.keys):
         # the plain model's say where joints stand; of another structure they would be invalid
         spec.delete(key)
-    _filter_commands(spec)
+    _plain_drives(spec)
     for term in terms:
         term.edit_spec(spec)
     try:
@@ -75,10 +75,11 @@ def _stiffest_friction(numerics: Numerics) -> list[float]:
     return [max(2 * numerics.timestep, 0.002), 1.0]
 
 
-def _filter_commands(spec: mujoco.MjSpec) -> None:
-    """Take the filters out of drives of joints: their commands come filtered (`lagged`), however they are simulated.
+def _plain_drives(spec: mujoco.MjSpec) -> None:
+    """Take the filters out of drives of joints, and give those without a bias one of nothing.
 
-    The time constant stays where MuJoCo has it, zero where there is no filter.
+    Their commands come filtered (`lagged`), however they are simulated; the time constant stays where MuJoCo has it, zero
+    where there is no filter. Laws that act on a drive's torque change its bias.
     """
     import mujoco
 
@@ -90,6 +91,8 @@ def _filter_commands(spec: mujoco.MjSpec) -> None:
             actuator.dyntype = mujoco.mjtDyn.mjDYN_NONE
         elif actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
             actuator.dynprm = [0.0, *actuator.dynprm[1:]]
+        if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:
+            actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, np.zeros(len(actuator.biasprm))
 
 
 def make_index(model: mujoco.MjModel) -> JointAddresses:

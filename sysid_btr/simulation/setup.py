@@ -41,6 +41,7 @@ class Setup:
     applied : (m, steps, j) torques at the joints known in advance, Nm or N.
     laws : terms that act at every step, in the order in which they do.
     inputs : measured inputs of the drives, (steps, m) each, for laws.
+    began : (m,) or of all, s on the clock of the log at the first step, for laws.
     held_steps : steps for which servos hold a torque; 0 where they act continuously.
     effort : whether the torques of the servos are asked for.
     """
@@ -51,6 +52,7 @@ class Setup:
     applied: FloatArray | None = None
     laws: tuple[Law, ...] = ()
     inputs: dict[str, FloatArray] = field(default_factory=dict)
+    began: FloatArray | float = 0.0
     held_steps: int = 0
     effort: bool = False
     control: FloatArray | None = None
@@ -126,7 +128,7 @@ def prepare(
     inputs : gives the measured inputs of the drives, (steps, m) each, where a law asks for them.
     effort : whether the torques of the servos are asked for.
     first : steps on the clock of the log before the first one, of each candidate (m,) or of all, for torques known in
-        advance.
+        advance and laws.
     lead : commands from before the first step, that reach into it when they are delayed.
     extra : (m, lead + steps, ...) what else was commanded, as `Grid.extra` has it.
     """
@@ -156,6 +158,7 @@ def prepare(
         applied,
         laws,
         inputs() if laws else {},
+        batch.timestep * np.asarray(first, dtype=np.float64),
         numerics.held_steps,
         effort,
         control,

@@ -60,6 +60,7 @@ class Candidates(NamedTuple):
     voltage, enabled, applied, control : (m, steps, j or c), or (0, 0, 0) where there are none.
     gear, gain, constant, stiffness, damping, least, most : (m, d) of the servos, see `ServoLaw`.
     low, high : (m, j).
+    began : (m,) s on the clock of the log at the first step.
     numbers : (m, n) of the laws.
     own_gain, own_bias, own_friction : actuator_gainprm and actuator_biasprm (m, d, 10), dof_frictionloss (m, j), as
         they are without laws.
@@ -81,6 +82,7 @@ class Candidates(NamedTuple):
     most: FloatArray
     low: FloatArray
     high: FloatArray
+    began: FloatArray
     numbers: FloatArray
     own_gain: FloatArray
     own_bias: FloatArray
@@ -147,7 +149,7 @@ def plan_of(setup: Setup) -> tuple[Plan, Candidates]:
         *(none if x is None else x for x in (setup.applied, setup.control)),
         *(law.gear, law.gain, law.constant, law.stiffness, law.damping),
         *(np.broadcast_to(x, shape) for x in (law.least, law.most)),
-        *(law.low, law.high, numbers),
+        *(law.low, law.high, np.broadcast_to(setup.began, setup.size), numbers),
         *(batch.read(name)[:, actuator] for name in ("actuator_gainprm", "actuator_biasprm")),
         batch.read("dof_frictionloss")[:, index.dof],
     )
@@ -298,7 +300,7 @@ def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Me
             step[ENABLED] = own.enabled[i, k]
         torque_of(i, plan, own, step[COMMAND], step[QPOS], step[QVEL], step[TORQUE])
         step[TORQUE] = np.minimum(np.maximum(step[TORQUE], step[LOW]), step[HIGH])
-        apply_laws(plan.laws, own.numbers[i], own.awake[i], memory.laws, k * h + 0.5 * h, h, step)
+        apply_laws(plan.laws, own.numbers[i], own.awake[i], memory.laws, own.began[i] + (k * h + 0.5 * h), h, step)
         if plan.friction:
             for j in range(len(q)):
                 engine.dof_frictionloss[plan.dof[j]] = max(own.own_friction[i, j] + step[FRICTION, j], 0.0)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import BatchModel, Kind, Parameter
 from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.law import Step, used_in_laws
 from sysid_btr.terms.scales import JointScale
 
 
@@ -134,12 +135,13 @@ class ExternalDisturbanceTrain(Effect):
 class DriveDisturbanceTrain(ExternalDisturbanceTrain):
     """Pulses added to the drive's input: the logged effort holds them, and the drive's limit clips them.
 
-    Command: a position servo feels them as an offset of its command by torque / kp, and that is how they enter.
+    Law: torque of the drive + the mean of the pulses over the step.
     """
 
     variant: ClassVar[str] = "drive_train"
     title: ClassVar[str] = "pulses in the servo's own torque"
     needs: ClassVar[str] = "effort"
+    law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         *ExternalDisturbanceTrain.confounders,
         ("external_disturbance", "a logged effort: a push from outside is not in it"),
@@ -148,22 +150,13 @@ class DriveDisturbanceTrain(ExternalDisturbanceTrain):
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
         return None
 
-    @property
-    def longest_delay(self) -> float:
-        return 0.0  # its times say when pulses come; no command is late
-
-    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
-        actuator = batch.index.actuator[batch.index.of(self.places)]
-        gains, gears = batch.read("actuator_gainprm"), batch.read("actuator_gear")
-        stiffness = gains[:, actuator, 0] * gears[:, actuator, 0] * batch.index.scale[batch.index.of(self.places)]
-        time = batch.timestep * np.arange(command.shape[1] + 1, dtype=np.float64)[None]
-        shaped = np.array(command)
-        for place, column in enumerate(batch.index.of(self.places)):
-            if actuator[place] >= 0:
-                kp = stiffness[:, place, None]
-                offset = np.divide(1.0, kp, out=np.zeros_like(kp), where=kp != 0)
-                shaped[:, :, column] += pulses(values[:, place], time) * offset
-        return shaped
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        begin, end = step.time - 0.5 * step.timestep, step.time + 0.5 * step.timestep
+        for p, j in enumerate(places):
+            start, duration, period = numbers[p, 1], numbers[p, 2], numbers[p, 3]
+            spent = time_in_pulses(end, start, duration, period) - time_in_pulses(begin, start, duration, period)
+            step.motor_torque[j] += numbers[p, 0] * spent / step.timestep
 
 
 def pulses(values: FloatArray, time: FloatArray) -> FloatArray:
@@ -172,15 +165,17 @@ def pulses(values: FloatArray, time: FloatArray) -> FloatArray:
     `time` (m or 1, steps + 1) is that of the borders of the steps.
     """
     amount, start, duration, period = (values[:, k, None] for k in range(4))
-    duration = np.minimum(duration, period)
+    spent = time_in_pulses(time, start, duration, period)
+    return np.asarray(amount * np.diff(spent, axis=1) / np.diff(time, axis=1))
 
-    def elapsed(t: FloatArray) -> FloatArray:
-        """Time spent in pulses until t."""
-        since = np.maximum(t - start, 0.0)
-        whole = np.floor(since / period)
-        return whole * duration + np.minimum(since - whole * period, duration)
 
-    return np.asarray(amount * np.diff(elapsed(time), axis=1) / np.diff(time, axis=1))
+@used_in_laws
+def time_in_pulses(time: Any, start: Any, duration: Any, period: Any) -> Any:
+    """Time spent in pulses until some moment; arrays or single numbers."""
+    since = np.maximum(time - start, 0.0)
+    whole = np.floor(since / period)
+    each = np.minimum(duration, period)
+    return whole * each + np.minimum(since - whole * period, each)
 
 
 def _near(parameters: tuple[Parameter, ...], values: FloatArray, kinds: int) -> tuple[Parameter, ...]:

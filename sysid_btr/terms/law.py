@@ -20,7 +20,7 @@ class Step(NamedTuple):
 
     Attributes
     ----------
-    time : s, in the middle of the step.
+    time : s since the first sample of the log, in the middle of the step.
     timestep : s.
     command : as it reaches the drives.
     qpos, qvel : of the motor side, extrapolated to the middle of the step, which makes a law that is held over the step

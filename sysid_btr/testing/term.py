@@ -104,7 +104,8 @@ class TermBench:
         """(m, samples, joints) positions, or torques of the servos, under values of a term, or of the plain model."""
         terms = () if term is None else (term,)
         outputs = Replay(self.study.robot, self.log, terms, numerics, effort).predict(np.array(candidates))
-        return outputs.position if outputs.effort is None else outputs.effort
+        # no step begins at the last sample, whose torque is not the same for all that is replayed
+        return outputs.position if outputs.effort is None else outputs.effort[:, :-1]
 
     def forms(self, cls: type[Term]) -> Iterator[tuple[Term, FloatArray]]:
         """The term at all its places, in each of its two meanings, with the values of a clear case."""
