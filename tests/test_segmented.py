@@ -17,6 +17,7 @@ from sysid_btr.errors import LogError, UsageError
 from sysid_btr.identify.episode import FixedEpisode
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.horizon import CURVED, is_held
+from sysid_btr.identify.missing_torque import missing_torques
 from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.refit import judge
 from sysid_btr.identify.scores import score
@@ -332,3 +333,22 @@ def test_a_joint_that_is_not_logged_starts_where_the_model_has_it() -> None:
 def test_what_segments_can_be(name: str, segments: str, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         Mode(name, segments)
+
+
+@pytest.mark.parametrize("mode", ["segments", "inverse"])
+def test_friction_that_is_missing_acts_against_the_motion_and_known_friction_leaves_nothing(mode: str) -> None:
+    """What motors give is compared with what the motion takes, whether segments or torques are compared."""
+    log, rng = driven(torque=QUIET, seconds=8.0), np.random.default_rng(1)
+    efforts = {f"effort.{j}": log.channels[f"command.{j}"] + rng.normal(scale=1e-3, size=len(log)) for j in JOINTS}
+    log = replace(log, channels={**log.channels, **(efforts if mode == "inverse" else {})})
+    study = make_study(double_pendulum(upper=MASS), [log], numerics=Numerics("RK4", 0.0025), threads=1, mode=Mode(mode))
+    dry = CoulombFriction.at(JOINTS, study.scales)
+
+    def levels(model: Model) -> dict[str, float]:
+        found = missing_torques(study.train_problem(model), model.values, study.scales)
+        return {one.joint: -float(np.mean(one.torque * one.direction)) for one in found}
+
+    missing, known = levels(Model.of(())), levels(Model.of((dry,)).at(np.array([FRICTION, FRICTION])))
+    for joint in JOINTS:
+        assert missing[joint] == pytest.approx(FRICTION, rel=0.2)
+        assert abs(known[joint]) < 0.1 * FRICTION

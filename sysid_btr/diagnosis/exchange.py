@@ -18,7 +18,8 @@ from sysid_btr.diagnosis.leads import Library, replacements
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt
-from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.effect import Effect, family_of
+from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
 
 
@@ -90,8 +91,7 @@ def _parts(state: State, rules: Selection) -> list[_Part]:
 def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Selection) -> State:
     """The state with a part as it is, or with what predicts better, or as well and is simpler, in its place."""
     model, at = state.fitted.model, state.effects.index(part.effect)
-    # a generalisation of what is there would have taken its place in the search
-    others = [h for h in others if part.effect.name not in h.effect.includes and not _said_of_more(h, part, model)]
+    others = [h for h in others if not _says_the_same(h, part, model)]
     hypotheses = others[: rules.exchanges]
     if part.whole:
         hypotheses += [h for h in state.evidence[at].alternatives if not _among(h, hypotheses)]
@@ -115,6 +115,17 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     left = state.without_evidence_of(part.effect) if part.whole else state.evidence
     state = replace(state, fitted=winner.fitted, evidence=(*left, known))
     return state.step(added=(str(winner.hypothesis),), removed=(str(part),))
+
+
+def _says_the_same(hypothesis: Hypothesis, part: _Part, model: Model) -> bool:
+    """Whether a hypothesis is a part said otherwise: of more places, more generally, or by a curve of the same family.
+
+    A generalisation would have taken its place in the search, and a curve may still follow it.
+    """
+    curve = hypothesis.effect in FREE_FORMS and type(part.effect) not in FREE_FORMS
+    if curve and family_of(hypothesis.effect) == family_of(type(part.effect)):
+        return True
+    return part.effect.name in hypothesis.effect.includes or _said_of_more(hypothesis, part, model)
 
 
 def _others(kind: type[Effect], places: Sequence[str], model: Model) -> set[tuple[str, ...]]:

@@ -42,7 +42,7 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
     began = perf_counter()
     found, residuals = _scan(state, [e for e in library if e not in FREE_FORMS], rules)
     hypotheses = form_hypotheses(found, residuals, state.study.scales, rules)
-    hypotheses += _curves(state, library, rules)
+    hypotheses += _curves(state.study, state.fitted.model, library, rules)
     if study.journal is not None:
         arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
         seconds = study.journal.seconds + perf_counter() - began
@@ -50,12 +50,11 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
     return hypotheses, len(found)
 
 
-def _curves(state: State, library: Library, rules: Selection) -> list[Hypothesis]:
-    """Of which variable what is missing is a smooth function: tried last, where no law says it more simply."""
+def _curves(study: Study, model: Model, library: Library, rules: Selection) -> list[Hypothesis]:
+    """Of which variable what a model leaves is a smooth function: tried last, where no law says it more simply."""
     asked = set(library) & set(FREE_FORMS)
     if not asked:
         return []
-    study, model = state.study, state.fitted.model
     problem = study.train_problem(model)
     forms = free_forms(problem, model.values, study.scales, missing_torques(problem, model.values, study.scales))
     own = [f.hypothesis for f in forms if f.hypothesis.effect in asked]
@@ -79,9 +78,12 @@ def replacements(state: State, library: Library, parts: Sequence[IntArray], rule
         without.append(whole.beside(residual + gone, np.delete(jacobian, part, axis=1)))
     found = responding(problem.with_numerics(study.cheap), model.values, without, asked, study.scales, rules)
     result = []
-    for own, rest in zip(found, without, strict=True):
+    for part, own, rest in zip(parts, found, without, strict=True):
         least = rules.replaces * float(rest.rest @ rest.rest - whole.rest @ whole.rest)
-        result.append([h for h in form_hypotheses(own, len(residual), study.scales, rules) if h.gain >= least])
+        laws = [h for h in form_hypotheses(own, len(residual), study.scales, rules) if h.gain >= least]
+        bare = model.values.copy()
+        bare[part] = model.terms.nominal[part]
+        result.append([*_curves(study, model.at(bare), library, rules)[:1], *laws])
     return result
 
 

@@ -12,6 +12,7 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
+from sysid_btr.terms.effect import family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
 
@@ -72,7 +73,10 @@ def is_outdone(rules: Selection, hypothesis: Hypothesis, trials: Sequence[Trial]
 
 
 def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Sequence[Trial]) -> bool:
-    """Whether a curve is not needed yet: a law there explains a good part of what it promises, and harms nothing."""
+    """Whether a curve is not needed yet: a law of its family there explains a good part of what it promises.
+
+    It must harm nothing.
+    """
     return hypothesis.effect in FREE_FORMS and any(
         float(before.train_cells.sum() - t.fitted.train_cells.sum()) >= rules.law * hypothesis.gain
         and t.fitted.holdout < (1 + rules.transient_harm) * before.holdout
@@ -81,9 +85,10 @@ def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Se
 
 
 def _laws_beside(curve: Hypothesis, trials: Sequence[Trial]) -> list[Trial]:
-    """Of several trials those of laws, at a place of a curve."""
-    places = set(curve.places)
-    return [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
+    """Of several trials those of laws of a curve's family, at a place of it: another cause is no form of the same."""
+    places, family = set(curve.places), family_of(curve.effect)
+    laws = (t for t in trials if t.hypothesis.effect not in FREE_FORMS)
+    return [t for t in laws if family_of(t.hypothesis.effect) == family and places & set(t.hypothesis.places)]
 
 
 def is_hopeless(rules: Selection, hypothesis: Hypothesis, best: Hypothesis, tried: int) -> bool:
@@ -138,7 +143,7 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
 
 
 def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner: Trial) -> Trial:
-    """Instead of a curve, a law at its place that explains a good part of the same: the curve may follow it."""
+    """Instead of a curve, a law of its family at its place that explains a good part of the same: it may follow."""
     if winner.hypothesis.effect not in FREE_FORMS:
         return winner
     enough = rules.law * (before.holdout - winner.fitted.holdout)

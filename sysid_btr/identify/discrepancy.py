@@ -25,6 +25,7 @@ from sysid_btr.identify.missing_torque import (
 )
 from sysid_btr.objectives.covariance import newton, spread
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
+from sysid_btr.simulation.inverse import InverseReplay
 from sysid_btr.terms.scales import Scales
 
 SHARE = 0.5
@@ -65,10 +66,11 @@ def discrepancy(problem: ReplayProblem, values: FloatArray, scales: Scales) -> D
     Returns
     -------
     Discrepancy or None
-        None where torques cannot be traced: over segments, on a free base, or where the replay diverges.
+        None where no sensor is known to answer torques: over segments, on a free base, or where the replay diverges.
     """
     responses = torque_responses(problem, values, scales)
-    left = missing_torques(problem, values, scales, responses)
+    torques = missing_torques(problem, values, scales, responses)
+    left = [one for one in torques if _answers(problem.episodes[one.episode], responses[one.episode])]
     if not left:
         return None
     worst = sorted({one.joint for one in left}, key=lambda j: -max(o.chi2 for o in left if o.joint == j))
@@ -81,6 +83,11 @@ def discrepancy(problem: ReplayProblem, values: FloatArray, scales: Scales) -> D
         seen = _responses(episode, response, own, {j: SHARE * size[j] / unit[j] for j in joints})
         parts.append(np.zeros((_count(episode), len(joints) * FEATURES)) if seen is None else seen)
     return Discrepancy(np.concatenate(parts))
+
+
+def _answers(episode: Comparison, response: TorqueResponse | None) -> bool:
+    """Whether it is known what an episode's sensors show of a torque: they may show it itself."""
+    return response is not None or isinstance(episode.replay, InverseReplay)
 
 
 def _count(episode: Comparison) -> int:

@@ -3,20 +3,25 @@
 A small torque pulse at each joint, simulated, gives the impulse responses of a subtree; Wiener deconvolution
 with them turns position errors into the disturbance torques that would explain them (Wiener 1949,
 "Extrapolation, Interpolation, and Smoothing of Stationary Time Series"). Joints of one subtree push each other,
-so a subtree is inverted as a whole.
+so a subtree is inverted as a whole. Segments are too short for such a response: there it is what the measured motion
+takes beyond what the drives give.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.errors import LogError
+from sysid_btr.identify.inverse import InverseEpisode
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP
 from sysid_btr.simulation.inverse import InverseReplay
+from sysid_btr.simulation.segments import SegmentReplay
 from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.disturbance import ExternalDisturbanceTrain
@@ -108,7 +113,8 @@ def missing_torques(
 ) -> tuple[MissingTorque, ...]:
     """Torques that a problem's model lacks, at every measured joint of every episode.
 
-    Where torques are compared they are what is left; elsewhere position errors are deconvolved into them.
+    Where torques are compared they are what is left. Position errors are deconvolved into them, or, over segments, what
+    the drives give is compared with what the motion takes; the latter is not to be had on a free base.
 
     Parameters
     ----------
@@ -129,13 +135,15 @@ def missing_torques(
             result += _compared(i, episode, episode.replay, values, scales)
         elif response is not None:
             result += _deconvolve(i, episode, response, scales)
+        elif isinstance(episode.replay, SegmentReplay) and episode.replay.index.base is None:
+            result += _of_motion(i, problem, episode.replay, values, scales)
     return tuple(result)
 
 
 def _compared(
     number: int, episode: Comparison, replay: InverseReplay, values: FloatArray, scales: Scales
 ) -> list[MissingTorque]:
-    """What is left where torques themselves are compared."""
+    """What is left where torques themselves are compared: what a drive gives too much, something else takes away."""
     motion, outputs = replay.motion, replay.predict(values[None])
     target = next(t for t in episode.targets if t.channel == "effort")
     rows = np.flatnonzero(target.mask.any(axis=1))
@@ -154,7 +162,7 @@ def _compared(
                 unit=scale_at(scales, joint).unit("Nm"),
                 period=motion.period,
                 time=motion.time[keep],
-                torque=error[keep, k],
+                torque=-error[keep, k],
                 noise=float(target.noise[k]),
                 residual=white[keep],
                 chi2=float(np.mean(white[mask] ** 2)) if mask.any() else 1.0,
@@ -168,6 +176,36 @@ def _compared(
                 gain=motion.seen(frequency),
             )
         )
+    return result
+
+
+def _of_motion(
+    number: int, problem: ReplayProblem, replay: SegmentReplay, values: FloatArray, scales: Scales
+) -> list[MissingTorque]:
+    """What the measured motion takes beyond what the drives give.
+
+    How loud a joint is, its positions say: they are what is compared.
+    """
+    target = next((t for t in problem.episodes[number].targets if t.channel == "position"), None)
+    outputs = replace(replay, effort=True).predict(values[None])
+    if target is None or outputs.effort is None or not np.isfinite(outputs.effort).all():
+        return []
+    log = replay.log
+    channels = {name: column for name, column in log.channels.items() if not name.startswith("effort.")}
+    channels |= {f"effort.{j}": outputs.effort[0][:, k] for j, k in zip(target.joints, target.columns, strict=True)}
+    try:
+        motion = InverseEpisode.whole(replay.robot, replace(log, channels=channels), replay.threads)
+        compared = motion.compare(problem.terms, ("effort",), replay.numerics, threads=replay.threads)
+    except LogError:
+        return []  # no joint moves, or too little is logged
+    found = _compared(number, compared, cast("InverseReplay", compared.replay), values, scales)
+    left = problem.column_chi2(problem.residuals(values[None])[0])
+    chi2 = {t.joints[k]: float(left[c]) for c, (i, t, k) in enumerate(problem.columns) if i == number and t is target}
+    error = np.nan_to_num((target.measured - target.predicted(outputs)[0]) / target.noise)
+    result = []
+    for one in found:
+        residual = np.interp(one.time, log.time - log.time[0], error[:, target.joints.index(one.joint)])
+        result.append(replace(one, chi2=chi2[one.joint], residual=residual))
     return result
 
 

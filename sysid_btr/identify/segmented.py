@@ -63,7 +63,7 @@ class SegmentedProcedure(Procedure):
     shares: ClassVar[tuple[float, ...]] = SHARES
     moves_split: ClassVar[bool] = False
     wanders: ClassVar[bool] = True
-    no_torque: ClassVar[str] = "segments are too short"
+    no_torque: ClassVar[str] = "the replay fails, or too little of it moves"
 
 
 @dataclass(frozen=True, eq=False)

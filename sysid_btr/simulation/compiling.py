@@ -78,8 +78,8 @@ def _stiffest_friction(numerics: Numerics) -> list[float]:
 def _plain_drives(spec: mujoco.MjSpec) -> None:
     """Take the filters out of drives of joints, and give those without a bias one of nothing.
 
-    Their commands come filtered (`lagged`), however they are simulated; the time constant stays where MuJoCo has it, zero
-    where there is no filter. Laws that act on a drive's torque change its bias.
+    Their commands come filtered (`lagged`), however they are simulated; the time constant stays where MuJoCo has it,
+    zero where there is no filter. Laws that act on a drive's torque change its bias.
     """
     import mujoco
 
