@@ -30,10 +30,12 @@ from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbanceTrain
 from sysid_btr.terms.free_form import FreeGainTime
-from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.friction import CoulombFriction, LoadFriction, ViscousDamping
+from sysid_btr.terms.inertial import Armature, Payload
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import TorqueScale
 from sysid_btr.terms.servo import CommandDelay
+from sysid_btr.terms.spring import JointSpring
 
 TWO = """<mujoco><worldbody>
 <body name="upper"><joint name="shoulder" axis="0 1 0" armature=".002" {dry}/>
@@ -352,3 +354,35 @@ def test_friction_that_is_missing_acts_against_the_motion_and_known_friction_lea
     for joint in JOINTS:
         assert missing[joint] == pytest.approx(FRICTION, rel=0.2)
         assert abs(known[joint]) < 0.1 * FRICTION
+
+
+HIDDEN = (
+    (CoulombFriction(("elbow",)), (0.02,)),
+    (ViscousDamping(("elbow",)), (0.02,)),
+    (JointSpring(("elbow",)), (0.1, 0.3)),
+    (Armature(("elbow",)), (0.004,)),
+    (LoadFriction(("elbow",)), (0.2,)),
+    (Payload(("lower",)), (0.05, 0.02, 0.0, -0.1, 1e-5)),
+    (CommandDelay(("elbow",)), (0.02,)),
+    (ExternalDisturbanceTrain(("elbow",)), (0.1, 0.3, 0.2, 0.9)),
+)
+HEAVIER, LIGHTER = 1.15, 0.9
+
+
+def test_intervals_over_segments_hold_the_truth_although_an_effect_is_missing() -> None:
+    """95 % of intervals should; of those that take the model as right, fewer do."""
+    robot, numerics, wide, narrow = double_pendulum('damping=".02"'), Numerics("RK4", 0.005), [], []
+    for seed, (effect, amounts) in enumerate(HIDDEN):
+        log, rng = driven(seed, torque=QUIET, seconds=8.0, dry='damping=".02"', upper=0.5), np.random.default_rng(seed)
+        declared = make_study(robot, [log], numerics=numerics, threads=1).declare(["mass:upper", "mass:lower"])
+        terms, values = (*declared, effect), np.array([[HEAVIER, LIGHTER, *amounts]])
+        moved = Replay(robot, log, terms, Numerics("RK4", 0.0025)).predict(values).position[0]
+        noisy = moved + rng.normal(scale=NOISE, size=moved.shape)
+        shown = {f"position.{j}": x for j, x in zip(JOINTS, noisy.T, strict=True)}
+        log = replace(log, channels={**log.channels, **shown})
+        found = fit(make_study(robot, [log], numerics=numerics, threads=1), ["mass:upper", "mass:lower"])
+        for one, truth in zip(found.estimates, (HEAVIER, LIGHTER), strict=True):
+            wide.append(one.ci95[0] <= truth <= one.ci95[1])
+            narrow.append(abs(one.value - truth) <= 2.0 * (one.std_if_right or one.std))
+    assert np.mean(wide) >= 0.9
+    assert np.mean(narrow) < np.mean(wide)

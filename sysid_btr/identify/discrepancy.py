@@ -25,7 +25,8 @@ from sysid_btr.identify.missing_torque import (
 )
 from sysid_btr.objectives.covariance import newton, spread
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
-from sysid_btr.simulation.inverse import InverseReplay
+from sysid_btr.simulation.segments import SegmentReplay
+from sysid_btr.terms.disturbance import KnownTorque
 from sysid_btr.terms.scales import Scales
 
 SHARE = 0.5
@@ -66,11 +67,10 @@ def discrepancy(problem: ReplayProblem, values: FloatArray, scales: Scales) -> D
     Returns
     -------
     Discrepancy or None
-        None where no sensor is known to answer torques: over segments, on a free base, or where the replay diverges.
+        None where torques cannot be traced: on a free base, or where the replay diverges.
     """
     responses = torque_responses(problem, values, scales)
-    torques = missing_torques(problem, values, scales, responses)
-    left = [one for one in torques if _answers(problem.episodes[one.episode], responses[one.episode])]
+    left = missing_torques(problem, values, scales, responses)
     if not left:
         return None
     worst = sorted({one.joint for one in left}, key=lambda j: -max(o.chi2 for o in left if o.joint == j))
@@ -78,16 +78,16 @@ def discrepancy(problem: ReplayProblem, values: FloatArray, scales: Scales) -> D
     size = {j: _size([one for one in left if one.joint == j]) for j in joints}
     unit = {j: _units([one for one in left if one.joint == j]) for j in joints}
     parts = []
+    amounts = {j: SHARE * size[j] / unit[j] for j in joints}
     for number, (episode, response) in enumerate(zip(problem.episodes, responses, strict=True)):
         own = {one.joint: one for one in left if one.episode == number}
-        seen = _responses(episode, response, own, {j: SHARE * size[j] / unit[j] for j in joints})
-        parts.append(np.zeros((_count(episode), len(joints) * FEATURES)) if seen is None else seen)
+        if not own:
+            parts.append(np.zeros((_count(episode), len(joints) * FEATURES)))
+        elif isinstance(episode.replay, SegmentReplay):
+            parts.append(_simulated(episode, values, own, amounts))
+        else:
+            parts.append(_responses(episode, response, own, amounts))
     return Discrepancy(np.concatenate(parts))
-
-
-def _answers(episode: Comparison, response: TorqueResponse | None) -> bool:
-    """Whether it is known what an episode's sensors show of a torque: they may show it itself."""
-    return response is not None or isinstance(episode.replay, InverseReplay)
 
 
 def _count(episode: Comparison) -> int:
@@ -128,10 +128,8 @@ def _units(ones: Sequence[MissingTorque]) -> FloatArray:
 
 def _responses(
     episode: Comparison, response: TorqueResponse | None, own: dict[str, MissingTorque], amounts: dict[str, FloatArray]
-) -> FloatArray | None:
+) -> FloatArray:
     """Change of an episode's whitened residual, (r, joints FEATURES), for torques of these amounts."""
-    if not own:
-        return None
     columns = []
     for joint, amount in amounts.items():
         changes = [np.zeros((*t.mask.shape, FEATURES)) for t in episode.targets]
@@ -149,6 +147,22 @@ def _responses(
                     change[:, k] = _at(time, own[joint].time, signal) / target.sigma[k]
         columns.append(np.concatenate([c[t.mask] for c, t in zip(changes, episode.targets, strict=True)]))
     return np.concatenate(columns, axis=1)
+
+
+def _simulated(
+    episode: Comparison, values: FloatArray, own: dict[str, MissingTorque], amounts: dict[str, FloatArray]
+) -> FloatArray:
+    """The same by simulation, whose segments start anew where data want them: (r, joints FEATURES)."""
+    time = next(iter(own.values())).time
+    torque = np.zeros((len(amounts), len(time), FEATURES))
+    for k, (joint, amount) in enumerate(amounts.items()):
+        if joint in own:
+            torque[k] = features(own[joint]) * amount
+    known = KnownTorque(tuple(amounts), time=time, torque=torque)
+    each = np.vstack([np.zeros(torque.shape[0] * FEATURES), np.eye(torque.shape[0] * FEATURES)])
+    wide = replace(episode.replay, terms=(*episode.replay.terms, known))
+    white = episode.whitened(wide.predict(np.hstack([np.tile(values, (len(each), 1)), each])))
+    return np.asarray(np.nan_to_num((white[1:] - white[0]).T))
 
 
 def _at(time: FloatArray, known: FloatArray, signal: FloatArray) -> FloatArray:
@@ -176,7 +190,7 @@ def widened(
     Returns
     -------
     tuple of Estimate
-        As they are where nothing can be said: over segments, on a free base.
+        As they are where nothing can be said: on a free base.
     """
     doubt = discrepancy(problem, values, scales)
     if doubt is None:

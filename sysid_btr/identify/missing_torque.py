@@ -39,6 +39,8 @@ EDGE = 0.1
 """Seconds before the end of an episode whose torque shows too late to be known."""
 SLOW = 0.05
 """Signal, relative to its rms, below which its sign is a matter of noise."""
+NEIGHBOURS = 4
+"""Frequencies on either side over which a spectrum is averaged."""
 ITERATIONS = 4
 """Of the estimate of how large the torques are."""
 
@@ -202,11 +204,40 @@ def _of_motion(
     left = problem.column_chi2(problem.residuals(values[None])[0])
     chi2 = {t.joints[k]: float(left[c]) for c, (i, t, k) in enumerate(problem.columns) if i == number and t is target}
     error = np.nan_to_num((target.measured - target.predicted(outputs)[0]) / target.noise)
+    time, commands = log.time - log.time[0], _commands(problem.episodes[number], target.columns)
     result = []
     for one in found:
-        residual = np.interp(one.time, log.time - log.time[0], error[:, target.joints.index(one.joint)])
-        result.append(replace(one, chi2=chi2[one.joint], residual=residual))
+        k = target.joints.index(one.joint)
+        residual, command = (np.interp(one.time, time, x[:, k]) for x in (error, commands))
+        result.append(_quietened(replace(one, chi2=chi2[one.joint], residual=residual, command=command)))
     return result
+
+
+def _quietened(one: MissingTorque) -> MissingTorque:
+    """What is seen of a torque through the noise of accelerations, which grows as the square of the frequency (Wiener).
+
+    Its level is what is left at the highest frequencies that are compared, if that is less than was thought.
+    """
+    from scipy.ndimage import uniform_filter1d
+
+    count = len(one.torque)
+    spectrum = np.fft.rfft(np.concatenate([one.torque, one.torque[::-1]]))
+    frequency = np.asarray(np.fft.rfftfreq(2 * count, one.period), dtype=np.float64)
+    shown = np.interp(frequency, one.frequency, one.gain)
+    power = uniform_filter1d(np.abs(spectrum) ** 2 / (2 * count), 2 * NEIGHBOURS + 1, mode="nearest")
+    noise = frequency**4 * shown**2
+    noise *= one.noise**2 / max(float(np.mean(noise)), 1e-300)
+    fast = shown > 0.5
+    fast &= frequency > 0.5 * frequency[fast].max()
+    noise *= min(float(np.median(power[fast] / np.maximum(noise[fast], 1e-300))), 1.0) if fast.any() else 1.0
+    seen = np.clip(1.0 - noise / np.maximum(power, 1e-300), 0.0, 1.0)
+    return replace(
+        one,
+        torque=np.asarray(np.fft.irfft(spectrum * seen, 2 * count)[:count]),
+        noise=float(np.sqrt(np.mean(noise * seen**2))),
+        frequency=frequency,
+        gain=shown * seen,
+    )
 
 
 @dataclass(frozen=True, eq=False)

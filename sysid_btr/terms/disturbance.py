@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Parameter
+from sysid_btr.terms.base import BatchModel, Kind, Parameter, Term
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.law import Step, used_in_laws
 from sysid_btr.terms.scales import JointScale
@@ -39,6 +39,37 @@ class ConstantForce(Effect):
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
         torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
         torque[:, :, batch.index.of(self.places)] = values[:, None, :, 0]
+        return torque
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTorque(Term):
+    """Torques on joints whose course is known, in amounts of each: what such torques would do, not a thing to free.
+
+    Torque: the courses at the middle of each step, each times its amount.
+
+    Attributes
+    ----------
+    time : (t,) s since the first sample of the log.
+    torque : (places, t, c) Nm or N for an amount of one.
+    """
+
+    time: FloatArray = field(default_factory=lambda: np.zeros(1))
+    torque: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 0)))
+
+    name: ClassVar[str] = "known_torque"
+
+    @property
+    def numbers(self) -> tuple[Kind, ...]:
+        return tuple(Kind(f"c{k}", "1", 0.0, -np.inf, np.inf, 1.0) for k in range(1, self.torque.shape[2] + 1))
+
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
+        torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
+        middle = np.broadcast_to(0.5 * (time[:, 1:] + time[:, :-1]), torque.shape[:2])
+        columns = batch.index.of(self.places)
+        for i, place, course in zip(*np.nonzero(values), strict=True):
+            now = np.interp(middle[i], self.time, self.torque[place, :, course])
+            torque[i, :, columns[place]] += values[i, place, course] * now
         return torque
 
 
