@@ -197,6 +197,8 @@ def _form(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale, 
     x = np.linspace(0.0, 1.0, 101) if more else np.linspace(*ends, 101)
     modes = effect.modes_at(x, *ends)
     line = modes @ curve.amounts
+    if issubclass(effect, FreeFriction) and line.mean() <= 0:
+        share = 0.0  # no friction pushes
     half = NORMAL * np.sqrt(np.einsum("nk,kl,nl->n", modes, curve.covariance, modes))
     hypothesis = Hypothesis(effect, (joint,), False, start, share * float(sum(weights)))
     term = effect.at((joint,), {joint: scale})

@@ -10,7 +10,7 @@ takes beyond what the drives give.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import LogError
 from sysid_btr.identify.inverse import InverseEpisode
+from sysid_btr.identify.projection import orthonormal
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP
 from sysid_btr.simulation.inverse import InverseReplay
@@ -64,6 +65,8 @@ class MissingTorque:
     servo, servo_measured : (n,) torque of the servo in the state that is replayed and in the one measured.
         The latter is what a failing servo does not give; but it also answers every disturbance.
     frequency, gain : (f,) Hz and fraction of a torque at that frequency that `torque` shows.
+    taken : (n, k) orthonormal, what the model's own numbers can do to it, which is taken off; none where that is not
+        known.
     """
 
     joint: str
@@ -83,6 +86,7 @@ class MissingTorque:
     servo_measured: FloatArray
     frequency: FloatArray
     gain: FloatArray
+    taken: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def direction(self) -> FloatArray:
@@ -96,7 +100,13 @@ class MissingTorque:
         at = np.fft.rfftfreq(len(mirrored), self.period)
         gain = np.interp(at, self.frequency, self.gain)
         spectrum *= gain if columns.ndim == 1 else gain[:, None]
-        return np.asarray(np.fft.irfft(spectrum, len(mirrored), axis=0)[: len(columns)])
+        shown = np.fft.irfft(spectrum, len(mirrored), axis=0)[: len(columns)]
+        return np.asarray(shown - self.taken @ (self.taken.T @ shown) if self.taken.size else shown)
+
+    def beside(self, columns: FloatArray) -> MissingTorque:
+        """The estimate without what torques (n, k), in any amounts, can do to it."""
+        basis = orthonormal(self.seen(columns))
+        return replace(self, torque=self.torque - basis @ (basis.T @ self.torque), taken=basis)
 
 
 def smooth_sign(signal: FloatArray) -> FloatArray:
@@ -184,13 +194,15 @@ def _compared(
 def _of_motion(
     number: int, problem: ReplayProblem, replay: SegmentReplay, values: FloatArray, scales: Scales
 ) -> list[MissingTorque]:
-    """What the measured motion takes beyond what the drives give.
+    """What the measured motion takes beyond what the drives give, whatever the model's own numbers are near these.
 
     How loud a joint is, its positions say: they are what is compared.
     """
     target = next((t for t in problem.episodes[number].targets if t.channel == "position"), None)
-    outputs = replace(replay, effort=True).predict(values[None])
-    if target is None or outputs.effort is None or not np.isfinite(outputs.effort).all():
+    step = np.where(values + problem.scale <= problem.upper, problem.scale, -problem.scale)
+    near = np.vstack([values, values + np.diag(step)])
+    outputs = replace(replay, effort=True).predict(near)
+    if target is None or outputs.effort is None or not np.isfinite(outputs.effort[0]).all():
         return []
     log = replay.log
     channels = {name: column for name, column in log.channels.items() if not name.startswith("effort.")}
@@ -200,16 +212,24 @@ def _of_motion(
         compared = motion.compare(problem.terms, ("effort",), replay.numerics, threads=replay.threads)
     except LogError:
         return []  # no joint moves, or too little is logged
-    found = _compared(number, compared, cast("InverseReplay", compared.replay), values, scales)
+    inverse = cast("InverseReplay", compared.replay)
+    found = _compared(number, compared, inverse, values, scales)
     left = problem.column_chi2(problem.residuals(values[None])[0])
     chi2 = {t.joints[k]: float(left[c]) for c, (i, t, k) in enumerate(problem.columns) if i == number and t is target}
     error = np.nan_to_num((target.measured - target.predicted(outputs)[0]) / target.noise)
     time, commands = log.time - log.time[0], _commands(problem.episodes[number], target.columns)
+    taken = inverse.predict(near).effort
+    assert taken is not None
     result = []
     for one in found:
         k = target.joints.index(one.joint)
         residual, command = (np.interp(one.time, time, x[:, k]) for x in (error, commands))
-        result.append(_quietened(replace(one, chi2=chi2[one.joint], residual=residual, command=command)))
+        given = outputs.effort[:, :, target.columns[k]]
+        more = np.array([np.interp(inverse.motion.time, time, x) for x in np.nan_to_num(given[1:] - given[0])])
+        change = taken[1:, :, target.columns[k]] - taken[0, :, target.columns[k]] - inverse.motion.low_passed(more.T).T
+        first = int(np.searchsorted(inverse.motion.time, one.time[0]))
+        shown = replace(one, chi2=chi2[one.joint], residual=residual, command=command)
+        result.append(_quietened(shown).beside(change[:, first : first + len(one.time)].T))
     return result
 
 
