@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
+from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_together, form_hypotheses
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity
 from sysid_btr.diagnosis.selection import STANDARD
+from sysid_btr.terms.free_form import FreeCurve, FreeFrictionSpeed, FreeTorquePeriodic, FreeTorquePosition
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.scales import JointScale, Scales
 
@@ -86,3 +87,23 @@ def test_one_amount_at_all_places_is_tried_once() -> None:
     everywhere = Sensitivity(alike, single[0].residual, np.arange(ROWS), column, amounts, gain, single[0].values)
     found = form_hypotheses([everywhere, *single], ROWS, SCALES, STANDARD)
     assert sum(h.shared for h in found) == 1
+
+
+def test_curves_that_are_the_best_of_several_joints_are_one_hypothesis_with_the_numbers_of_each() -> None:
+    def curve(form: type[FreeCurve], joint: str, gain: float) -> Hypothesis:
+        return Hypothesis(form, (joint,), False, np.full(len(form.kinds), gain), gain)
+
+    found = [
+        curve(FreeTorquePeriodic, "left", 900.0),
+        curve(FreeTorquePeriodic, "right", 700.0),
+        curve(FreeFrictionSpeed, "hip", 600.0),
+        curve(FreeTorquePeriodic, "head", 200.0),  # too little beside the first
+        curve(FreeTorquePosition, "right", 650.0),  # not the best of its joint
+        curve(FreeFrictionSpeed, "left", 800.0),
+    ]
+    (one,) = curves_together(found, STANDARD)
+    assert one.effect is FreeTorquePeriodic
+    assert one.places == ("left", "right")
+    assert one.gain == 1600.0
+    np.testing.assert_array_equal(one.start, np.repeat([900.0, 700.0], len(FreeTorquePeriodic.kinds)))
+    assert curves_together(found[2:3], STANDARD) == []

@@ -38,13 +38,23 @@ from sysid_btr.diagnosis.selection import (
     verdict_limit,
 )
 from sysid_btr.diagnosis.split import cut_time
-from sysid_btr.diagnosis.trials import Trial, candidates_of, choose, is_hopeless, is_outdone, is_rival, is_superfluous
+from sysid_btr.diagnosis.trials import (
+    Trial,
+    candidates_of,
+    choose,
+    has_law,
+    is_hopeless,
+    is_outdone,
+    is_rival,
+    is_superfluous,
+)
 from sysid_btr.diagnosis.verdict import giving_way, verdict_of
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted, paired_t
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.free_form import FreeFrictionSpeed
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionLarger, StribeckFriction, ViscousDamping
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import JointScale, Scales
@@ -386,6 +396,30 @@ def test_what_is_simpler_than_a_full_explanation_must_promise_less_to_be_superfl
     gain: float, expected: bool
 ) -> None:
     assert is_superfluous(RULES, hypothesis(SIMPLE, gain=gain), [trial(GENERAL, fitted())]) is expected
+
+
+def of(effect: type[Effect], held_out: float, gain: float = 0.0) -> Trial:
+    """A trial at one joint that leaves so much of all; `gain` is what was promised."""
+    cells = np.full((1, 1), held_out)
+    start = np.zeros(len(effect.kinds))
+    return Trial(Hypothesis(effect, ("knee",), False, start, gain), replace(fitted([held_out]), train_cells=cells))
+
+
+@pytest.mark.parametrize(
+    ("law", "left", "first"),
+    [
+        (ViscousDamping, 5.0, True),  # nearly all of what the curve of friction does
+        (ViscousDamping, 20.0, False),
+        (ExternalDisturbance, 5.0, False),  # another cause is no form of the same
+    ],
+)
+def test_a_law_goes_before_a_curve_of_its_family_if_it_explains_nearly_as_much(
+    law: type[Effect], left: float, first: bool
+) -> None:
+    before = replace(fitted([100.0]), train_cells=np.full((1, 1), 100.0))
+    simple, curve = of(law, left), of(FreeFrictionSpeed, 1.0, gain=99.0)
+    assert has_law(RULES, curve.hypothesis, before, [simple]) is first
+    assert choose(RULES, before, [simple, curve]) is (simple if first else curve)
 
 
 @pytest.mark.parametrize(

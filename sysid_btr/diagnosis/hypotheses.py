@@ -96,6 +96,28 @@ def form_hypotheses(found: Sequence[Sensitivity], residuals: int, scales: Scales
     return _varied(_without_idle(result, rules), rules)
 
 
+def curves_together(curves: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
+    """Curves of one variable at several joints, best first: one cause may act at all of them.
+
+    Parameters
+    ----------
+    curves : at a joint each; the first of a joint is the best there, and others do not count.
+    rules : how much a joint must explain beside the one that explains most, and how many numbers a hypothesis may add.
+    """
+    best: dict[str, Hypothesis] = {}
+    for curve in curves:
+        best.setdefault(curve.places[0], curve)
+    result = []
+    for effect in dict.fromkeys(h.effect for h in best.values()):
+        lead, *others = sorted((h for h in best.values() if h.effect is effect), key=lambda h: -h.gain)
+        alike = [lead, *(h for h in others if h.gain >= rules.location_rival * lead.gain)]
+        alike = alike[: max(rules.most_parameters // len(effect.kinds), 1)]
+        if len(alike) > 1:
+            places, start = tuple(h.places[0] for h in alike), np.concatenate([h.start for h in alike])
+            result.append(Hypothesis(effect, places, False, start, sum(h.gain for h in alike)))
+    return sorted(result, key=lambda h: -h.gain)
+
+
 def to_arrays(
     hypotheses: Sequence[Hypothesis], effects: Sequence[type[Effect]], places: Sequence[str]
 ) -> dict[str, FloatArray]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.diagnosis.free_form import free_forms
-from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses, from_arrays, to_arrays
+from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_together, form_hypotheses, from_arrays, to_arrays
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, perturbations, responding, scan
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.signature import proposals
@@ -58,23 +58,7 @@ def _curves(study: Study, model: Model, library: Library, rules: Selection) -> l
     problem = study.train_problem(model)
     forms = free_forms(problem, model.values, study.scales, missing_torques(problem, model.values, study.scales))
     own = [f.hypothesis for f in forms if f.hypothesis.effect in asked and f.hypothesis.gain >= rules.candidate_gain]
-    return [*_together(own, rules), *own][: rules.curves]
-
-
-def _together(curves: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:
-    """Curves of one variable at several joints, each the best there, best first: one cause may act at all of them."""
-    best: dict[str, Hypothesis] = {}
-    for curve in curves:
-        best.setdefault(curve.places[0], curve)
-    result = []
-    for effect in dict.fromkeys(h.effect for h in best.values()):
-        lead, *others = sorted((h for h in best.values() if h.effect is effect), key=lambda h: -h.gain)
-        alike = [lead, *(h for h in others if h.gain >= rules.location_rival * lead.gain)]
-        alike = alike[: max(rules.most_parameters // len(effect.kinds), 1)]
-        if len(alike) > 1:
-            places, start = tuple(h.places[0] for h in alike), np.concatenate([h.start for h in alike])
-            result.append(Hypothesis(effect, places, False, start, sum(h.gain for h in alike)))
-    return sorted(result, key=lambda h: -h.gain)
+    return [*curves_together(own, rules), *own][: rules.curves]
 
 
 def replacements(state: State, library: Library, parts: Sequence[IntArray], rules: Selection) -> list[list[Hypothesis]]:
