@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from toys import PENDULUM, SCALE, pendulum, robot_from_xml, swing
 
+from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.leads import leading_hypotheses
 from sysid_btr.diagnosis.selection import STANDARD
 from sysid_btr.diagnosis.state import State
@@ -29,7 +30,7 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbanceTrain
-from sysid_btr.terms.free_form import FreeGainTime
+from sysid_btr.terms.free_form import FreeGainTime, FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, ViscousDamping
 from sysid_btr.terms.inertial import Armature, Payload
 from sysid_btr.terms.model import Model
@@ -386,3 +387,23 @@ def test_intervals_over_segments_hold_the_truth_although_an_effect_is_missing() 
             narrow.append(abs(one.value - truth) <= 2.0 * (one.std_if_right or one.std))
     assert np.mean(wide) >= 0.9
     assert np.mean(narrow) < np.mean(wide)
+
+
+def test_a_wave_from_outside_is_named_where_motors_drive_and_nothing_where_there_is_none() -> None:
+    robot, rng = double_pendulum('damping=".02"'), np.random.default_rng(3)
+    log = driven(3, torque=QUIET, seconds=8.0, dry='damping=".02"', upper=0.5)
+    scales = make_study(robot, [log], numerics=Numerics("RK4", 0.005), threads=1).scales
+    wave = FreeTorquePeriodic.at(("elbow",), scales)
+    numbers = np.zeros(len(wave.kinds))
+    for size, named in ((0.0, ()), (0.05, ("free_torque",))):
+        numbers[0], numbers[-1] = size, 2.3
+        moved = Replay(robot, log, (wave,), Numerics("RK4", 0.0025)).predict(numbers[None]).position[0]
+        noisy = moved + rng.normal(scale=NOISE, size=moved.shape)
+        shown = {f"position.{j}": x for j, x in zip(JOINTS, noisy.T, strict=True)}
+        study = make_study(robot, [replace(log, channels={**log.channels, **shown})], threads=1)
+        found = close(study, ["mass:*"])
+        assert tuple(e.effect for e in found.effects) == named
+    (effect,) = found.effects
+    assert effect.where == ("elbow",)
+    assert found.verdict == "explained"
+    assert effect.parameters[-1].value == pytest.approx(2.3, abs=0.02)

@@ -92,9 +92,11 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     """The state with a part as it is, or with what predicts better, or as well and is simpler, in its place."""
     model, at = state.fitted.model, state.effects.index(part.effect)
     others = [h for h in others if not _says_the_same(h, part, model)]
-    hypotheses = others[: rules.exchanges]
+    hypotheses = [h for h in others if h.effect not in FREE_FORMS][: rules.exchanges]
+    hypotheses += [h for h in others if h.effect in FREE_FORMS]
     if part.whole:
-        hypotheses += [h for h in state.evidence[at].alternatives if not _among(h, hypotheses)]
+        known = [h for h in state.evidence[at].alternatives if not _refines_a_law(h, model)]
+        hypotheses += [h for h in known if not _among(h, hypotheses)]
         hypotheses += [h for h in _at_fewer(part, model) if not _among(h, hypotheses)]
     rest = part.without(model, state)
     hypotheses = [h for h in hypotheses if rest.terms.admit(h.effect, h.places)]
@@ -107,25 +109,30 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     if winner is not trials[0] and state.study.procedure.wanders and not is_likely(rules, state.fitted, winner, trials):
         # what is left grows in such a replay, and much would take it up: see `search`
         winner = trials[0]
-    known = evidence_of(rules, winner, trials)
+    evidence = evidence_of(rules, winner, trials)
     if winner is trials[0]:
         if not part.whole:
             return state
-        return replace(state, evidence=(*state.evidence[:at], known, *state.evidence[at + 1 :]))
+        return replace(state, evidence=(*state.evidence[:at], evidence, *state.evidence[at + 1 :]))
     left = state.without_evidence_of(part.effect) if part.whole else state.evidence
-    state = replace(state, fitted=winner.fitted, evidence=(*left, known))
+    state = replace(state, fitted=winner.fitted, evidence=(*left, evidence))
     return state.step(added=(str(winner.hypothesis),), removed=(str(part),))
 
 
 def _says_the_same(hypothesis: Hypothesis, part: _Part, model: Model) -> bool:
-    """Whether a hypothesis is a part said otherwise: of more places, more generally, or by a curve of the same family.
-
-    A generalisation would have taken its place in the search, and a curve may still follow it.
-    """
-    curve = hypothesis.effect in FREE_FORMS and type(part.effect) not in FREE_FORMS
-    if curve and family_of(hypothesis.effect) == family_of(type(part.effect)):
+    """Whether a hypothesis is what is there, more generally or of more places: the search would have taken it."""
+    if part.effect.name in hypothesis.effect.includes or _said_of_more(hypothesis, part, model):
         return True
-    return part.effect.name in hypothesis.effect.includes or _said_of_more(hypothesis, part, model)
+    return _refines_a_law(hypothesis, model)
+
+
+def _refines_a_law(hypothesis: Hypothesis, model: Model) -> bool:
+    """Whether a hypothesis is a curve of a cause of which the model has a law there, to which it would be added."""
+    if hypothesis.effect not in FREE_FORMS:
+        return False
+    laws = [t for t in model.terms if isinstance(t, Effect) and type(t) not in FREE_FORMS]
+    family, places = family_of(hypothesis.effect), set(hypothesis.places)
+    return any(family_of(type(law)) == family and places & set(law.places) for law in laws)
 
 
 def _others(kind: type[Effect], places: Sequence[str], model: Model) -> set[tuple[str, ...]]:

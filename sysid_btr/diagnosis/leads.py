@@ -62,7 +62,7 @@ def _curves(study: Study, model: Model, library: Library, rules: Selection) -> l
 
 
 def replacements(state: State, library: Library, parts: Sequence[IntArray], rules: Selection) -> list[list[Hypothesis]]:
-    """What would explain, to first order, most of what each part of the model does: hypotheses, best first.
+    """What would explain, to first order, most of what each part of the model does: laws, best first, and a curve.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def replacements(state: State, library: Library, parts: Sequence[IntArray], rule
         laws = [h for h in form_hypotheses(own, len(residual), study.scales, rules) if h.gain >= least]
         bare = model.values.copy()
         bare[part] = model.terms.nominal[part]
-        result.append([*_curves(study, model.at(bare), library, rules)[:1], *laws])
+        result.append([*laws, *_curves(study, model.at(bare), library, rules)[:1]])
     return result
 
 

@@ -172,7 +172,7 @@ class Selection:
     """Fraction of what a part of the model explains that something else must promise, to first order, to be tried in
     its place. Time: what promises less hardly ever does more."""
     exchanges: int = 2
-    """Hypotheses that are tried in the place of a part, beside those that were weighed when it was added. Time."""
+    """Laws that are tried in the place of a part, beside a curve and what was weighed when it was added. Time."""
 
     # --- verdict ---
 
