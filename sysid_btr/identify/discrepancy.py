@@ -83,7 +83,7 @@ def discrepancy(problem: ReplayProblem, values: FloatArray, scales: Scales) -> D
         own = {one.joint: one for one in left if one.episode == number}
         if not own:
             parts.append(np.zeros((_count(episode), len(joints) * FEATURES)))
-        elif isinstance(episode.replay, SegmentReplay):
+        elif response is None and isinstance(episode.replay, SegmentReplay):
             parts.append(_simulated(episode, values, own, amounts))
         else:
             parts.append(_responses(episode, response, own, amounts))

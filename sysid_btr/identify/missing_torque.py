@@ -19,6 +19,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import LogError
 from sysid_btr.identify.inverse import InverseEpisode
 from sysid_btr.identify.projection import orthonormal
+from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.objectives.targets import WARM_UP
 from sysid_btr.simulation.inverse import InverseReplay
@@ -147,7 +148,7 @@ def missing_torques(
             result += _compared(i, episode, episode.replay, values, scales)
         elif response is not None:
             result += _deconvolve(i, episode, response, scales)
-        elif isinstance(episode.replay, SegmentReplay) and episode.replay.index.base is None:
+        elif isinstance(episode.replay, SegmentReplay) and not len(free_joints(episode.replay.model)):
             result += _of_motion(i, problem, episode.replay, values, scales)
     return tuple(result)
 
@@ -225,11 +226,12 @@ def _of_motion(
         k = target.joints.index(one.joint)
         residual, command = (np.interp(one.time, time, x[:, k]) for x in (error, commands))
         given = outputs.effort[:, :, target.columns[k]]
-        more = np.array([np.interp(inverse.motion.time, time, x) for x in np.nan_to_num(given[1:] - given[0])])
-        change = taken[1:, :, target.columns[k]] - taken[0, :, target.columns[k]] - inverse.motion.low_passed(more.T).T
-        first = int(np.searchsorted(inverse.motion.time, one.time[0]))
         shown = replace(one, chi2=chi2[one.joint], residual=residual, command=command)
-        result.append(_quietened(shown).beside(change[:, first : first + len(one.time)].T))
+        more = taken[1:, :, target.columns[k]] - taken[0, :, target.columns[k]]
+        for change, driven in zip(more, np.nan_to_num(given[1:] - given[0]), strict=True):
+            change -= motion.kinematics.low_passed(np.interp(motion.kinematics.time, time, driven)[:, None])[:, 0]
+        first = int(np.searchsorted(motion.kinematics.time, one.time[0]))
+        result.append(_quietened(shown).beside(more[:, first : first + len(one.time)].T))
     return result
 
 
@@ -247,8 +249,7 @@ def _quietened(one: MissingTorque) -> MissingTorque:
     power = uniform_filter1d(np.abs(spectrum) ** 2 / (2 * count), 2 * NEIGHBOURS + 1, mode="nearest")
     noise = frequency**4 * shown**2
     noise *= one.noise**2 / max(float(np.mean(noise)), 1e-300)
-    fast = shown > 0.5
-    fast &= frequency > 0.5 * frequency[fast].max()
+    fast = (shown > 0.5) & (frequency > 0.5 * np.max(frequency, where=shown > 0.5, initial=0.0))
     noise *= min(float(np.median(power[fast] / np.maximum(noise[fast], 1e-300))), 1.0) if fast.any() else 1.0
     seen = np.clip(1.0 - noise / np.maximum(power, 1e-300), 0.0, 1.0)
     return replace(
