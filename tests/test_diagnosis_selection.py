@@ -54,7 +54,7 @@ from sysid_btr.identify.refit import Fitted, paired_t
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.free_form import FreeFrictionSpeed
+from sysid_btr.terms.free_form import FreeFrictionSpeed, FreeTorqueLoad, FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionLarger, StribeckFriction, ViscousDamping
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import JointScale, Scales
@@ -406,20 +406,23 @@ def of(effect: type[Effect], held_out: float, gain: float = 0.0) -> Trial:
 
 
 @pytest.mark.parametrize(
-    ("law", "left", "first"),
+    ("curve", "law", "left", "first"),
     [
-        (ViscousDamping, 5.0, True),  # nearly all of what the curve of friction does
-        (ViscousDamping, 20.0, False),
-        (ExternalDisturbance, 5.0, False),  # another cause is no form of the same
+        (FreeFrictionSpeed, ViscousDamping, 40.0, True),  # most of what the curve does
+        (FreeFrictionSpeed, ViscousDamping, 60.0, False),
+        (FreeTorqueLoad, ViscousDamping, 40.0, True),
+        (FreeTorquePeriodic, ExternalDisturbance, 5.0, True),  # nearly all of it
+        (FreeTorquePeriodic, ExternalDisturbance, 20.0, False),
+        (FreeTorquePeriodic, ViscousDamping, 5.0, False),  # nothing of the robot has a clock of its own
     ],
 )
-def test_a_law_goes_before_a_curve_of_its_family_if_it_explains_nearly_as_much(
-    law: type[Effect], left: float, first: bool
+def test_a_law_goes_before_a_curve_if_it_explains_enough_of_the_same(
+    curve: type[Effect], law: type[Effect], left: float, first: bool
 ) -> None:
     before = replace(fitted([100.0]), train_cells=np.full((1, 1), 100.0))
-    simple, curve = of(law, left), of(FreeFrictionSpeed, 1.0, gain=99.0)
-    assert has_law(RULES, curve.hypothesis, before, [simple]) is first
-    assert choose(RULES, before, [simple, curve]) is (simple if first else curve)
+    simple, learnt = of(law, left), of(curve, 1.0, gain=99.0)
+    assert has_law(RULES, learnt.hypothesis, before, [simple]) is first
+    assert choose(RULES, before, [simple, learnt]) is (simple if first else learnt)
 
 
 @pytest.mark.parametrize(

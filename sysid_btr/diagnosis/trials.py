@@ -13,7 +13,7 @@ from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, 
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import family_of
-from sysid_btr.terms.free_form import FREE_FORMS
+from sysid_btr.terms.free_form import FREE_FORMS, FreeTorquePeriodic
 from sysid_btr.terms.model import Model
 
 
@@ -73,22 +73,28 @@ def is_outdone(rules: Selection, hypothesis: Hypothesis, trials: Sequence[Trial]
 
 
 def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Sequence[Trial]) -> bool:
-    """Whether a curve is not needed yet: a law of its family there explains a good part of what it promises.
-
-    It must harm nothing.
-    """
-    return hypothesis.effect in FREE_FORMS and any(
-        float(before.train_cells.sum() - t.fitted.train_cells.sum()) >= rules.law * hypothesis.gain
+    """Whether a curve is not needed yet: a law there explains a good part of what it promises, and harms nothing."""
+    if hypothesis.effect not in FREE_FORMS:
+        return False
+    laws, enough = _laws_beside(rules, hypothesis, trials)
+    return any(
+        float(before.train_cells.sum() - t.fitted.train_cells.sum()) >= enough * hypothesis.gain
         and t.fitted.holdout < (1 + rules.transient_harm) * before.holdout
-        for t in _laws_beside(hypothesis, trials)
+        for t in laws
     )
 
 
-def _laws_beside(curve: Hypothesis, trials: Sequence[Trial]) -> list[Trial]:
-    """Of several trials those of laws of a curve's family, at a place of it: another cause is no form of the same."""
-    places, family = set(curve.places), family_of(curve.effect)
-    laws = (t for t in trials if t.hypothesis.effect not in FREE_FORMS)
-    return [t for t in laws if family_of(t.hypothesis.effect) == family and places & set(t.hypothesis.places)]
+def _laws_beside(rules: Selection, curve: Hypothesis, trials: Sequence[Trial]) -> tuple[list[Trial], float]:
+    """Of several trials those of laws that go before a curve, and if they explain which fraction of what it does.
+
+    Functions of a robot's state resemble one another along a motion; what has a clock of its own resembles no law of
+    another family.
+    """
+    places = set(curve.places)
+    laws = [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
+    if curve.effect is not FreeTorquePeriodic:
+        return laws, rules.law
+    return [t for t in laws if family_of(t.hypothesis.effect) == family_of(curve.effect)], rules.law_of_clock
 
 
 def is_hopeless(rules: Selection, hypothesis: Hypothesis, best: Hypothesis, tried: int) -> bool:
@@ -143,11 +149,12 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
 
 
 def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner: Trial) -> Trial:
-    """Instead of a curve, a law of its family at its place that explains a good part of the same: it may follow."""
+    """Instead of a curve, a law at its place that explains a good part of the same: the curve may follow it."""
     if winner.hypothesis.effect not in FREE_FORMS:
         return winner
-    enough = rules.law * (before.holdout - winner.fitted.holdout)
-    laws = [t for t in _laws_beside(winner.hypothesis, trials) if before.holdout - t.fitted.holdout >= enough]
+    laws, enough = _laws_beside(rules, winner.hypothesis, trials)
+    gain = before.holdout - winner.fitted.holdout
+    laws = [t for t in laws if before.holdout - t.fitted.holdout >= enough * gain]
     return _simplest(rules, laws) if laws else winner
 
 
