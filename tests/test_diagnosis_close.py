@@ -530,3 +530,19 @@ def test_friction_that_falls_with_speed_by_nothing_is_dry_friction() -> None:
     state = replace(state, fitted=attempt(study, state.fitted.model, falling, STANDARD).fitted, evidence=(Evidence(),))
     (effect,) = eliminate(state, (CoulombFriction, StribeckFriction), STANDARD, silent).effects
     assert (effect.name, effect.places) == ("coulomb_friction", KNEE)
+
+
+@pytest.mark.slow
+def test_a_real_axis_is_told_its_friction_by_laws_with_the_values_that_were_published(shared_data: Path) -> None:
+    """An axis that a motor drives (EMPS: Janot, Gautier and Brunot 2019): 95.1 kg, 203.5 N s/m, 20.4 and 3.16 N.
+
+    A curve over load would take up what a mass and a friction do together.
+    """
+    log = read_log(shared_data / "emps" / "emps.parquet")
+    found = close(make_study(load_robot("emps"), [log], threads=1), ["mass:*"])
+    published = {"mass": 1.0, "coulomb_friction": 20.4, "viscous_damping": 203.5, "constant_force": 3.16}
+    estimates = {one.name.partition(":")[0]: one for one in found.estimates}
+    assert {"coulomb_friction", "viscous_damping"} <= estimates.keys() <= published.keys()
+    for name, estimate in estimates.items():
+        assert estimate.ci95[0] <= published[name] <= estimate.ci95[1]
+        assert name == "constant_force" or estimate.std < 0.25 * published[name]
