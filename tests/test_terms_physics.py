@@ -393,7 +393,7 @@ def test_back_emf_damps_a_driven_joint_as_friction_does_and_a_released_one_not()
     log = swing()
     for robot in (pendulum(), robot_from_xml(MOTORED)):
         damped = position(robot, log, [at_arm(ViscousDamping)], [0.05])
-        np.testing.assert_allclose(position(robot, log, [at_arm(BackEmf)], [0.05]), damped, atol=4e-4)
+        np.testing.assert_allclose(position(robot, log, [at_arm(BackEmf)], [0.05]), damped, atol=2e-4)
         assert np.abs(damped - position(robot, log)).max() > 1e-2
     damped = position(pendulum(), log, [at_arm(ViscousDamping)], [0.05])
     released = make_log(log.time, {**log.channels, "enabled.arm": np.zeros(len(log.time))})
