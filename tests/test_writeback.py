@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from sysid_btr.cli import run
 from sysid_btr.cli.demo import sample_logs
 from sysid_btr.diagnosis.closing import Closing
-from sysid_btr.display.changes import change_lines, model_lines
+from sysid_btr.display.changes import change_lines, fidelity, model_lines
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.intervals import Estimate
@@ -639,6 +639,17 @@ def test_every_change_is_told_in_a_line(fitted: Any, out: Folder) -> None:
     assert any(line.startswith("joint KneePitch frictionloss 0 -> 0.30") and "Nm)" in line for line in lines)
     assert "model.xml: reloaded, it moves as reported" in list(model_lines(result))
     json.dumps(result, allow_nan=False)
+
+
+def test_a_file_that_holds_less_than_the_fit_says_what_that_costs() -> None:
+    written = {"reproduces": False, "loss": {"holdout": 993.0}, "reported_loss": {"holdout": 100.0}, "not_told": []}
+    assert fidelity(written) == "reloaded, its loss on held-out data is 9.93 times the reported one"
+    held = fidelity({**written, "not_told": ["mass:link1"]})
+    assert held == (
+        "reloaded, with what is not identifiable left at nominal, "
+        "its loss on held-out data is 9.93 times the reported one"
+    )
+    assert fidelity({**written, "loss": {"holdout": None}}) == "reloaded, its replay diverges"
 
 
 def test_what_makes_room_for_an_effect_is_told_with_it(own: Path) -> None:

@@ -96,7 +96,8 @@ def fidelity(written: Mapping[str, Any]) -> str:
         return "reloaded, it moves as reported"
     if own is None or reported is None or reported == 0:
         return "reloaded, its replay diverges"
-    return f"reloaded, its loss on held-out data is {own / reported:.6g} times the reported one"
+    held = "with what is not identifiable left at nominal, " if written["not_told"] else ""
+    return f"reloaded, {held}its loss on held-out data is {own / reported:.4g} times the reported one"
 
 
 def _cost(part: Mapping[str, Any], written: Mapping[str, Any]) -> str:
