@@ -32,7 +32,7 @@ from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbanceTrain
 from sysid_btr.terms.free_form import FreeGainTime, FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, ViscousDamping
-from sysid_btr.terms.inertial import Armature
+from sysid_btr.terms.inertial import Armature, Payload
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import TorqueScale
 from sysid_btr.terms.servo import CommandDelay
@@ -363,7 +363,9 @@ HIDDEN = (
     (JointSpring(("elbow",)), (0.1, 0.3)),
     (Armature(("elbow",)), (0.004,)),
     (LoadFriction(("elbow",)), (0.2,)),
+    (Payload(("lower",)), (0.05, 0.02, 0.0, -0.1, 1e-5)),
     (CommandDelay(("elbow",)), (0.02,)),
+    (ExternalDisturbanceTrain(("elbow",)), (0.1, 0.3, 0.2, 0.9)),
 )
 HEAVIER, LIGHTER = 1.15, 0.9
 
