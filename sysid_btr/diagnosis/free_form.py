@@ -164,7 +164,7 @@ def _forms(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale)
         yield _form(effect, own, scale, ())
     elif len(own) > 1:
         return  # the clocks of several logs have nothing to do with each other
-    elif effect is not FreeTorquePeriodic:
+    elif not effect.periodic:
         yield _form(effect, own, scale, ())
     else:
         lines = [_form(effect, own, scale, (f,)) for f in frequencies(own[0].one)]
@@ -211,8 +211,7 @@ def design(
     effect: type[FreeCurve], one: MissingTorque, ends: tuple[float, float], frequency: float = 1.0
 ) -> FloatArray:
     """(n, modes) torques of a form's modes along an estimate, each of rms 1 over its range."""
-    x = VARIABLES[effect](one)
-    modes = effect.modes_at(x * frequency if effect is FreeTorquePeriodic else x, *ends)
+    modes = effect.modes_at(VARIABLES[effect](one) * frequency, *ends)
     acts = next((torque for base, torque in PER_UNIT.items() if issubclass(effect, base)), None)
     return modes if acts is None else np.asarray(acts(one)[:, None] * modes)
 

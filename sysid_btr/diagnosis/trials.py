@@ -13,7 +13,7 @@ from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, 
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import family_of
-from sysid_btr.terms.free_form import FREE_FORMS, FreeTorquePeriodic
+from sysid_btr.terms.free_form import FREE_FORMS, FreeCurve
 from sysid_btr.terms.model import Model
 
 
@@ -85,16 +85,16 @@ def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Se
 
 
 def _laws_beside(rules: Selection, curve: Hypothesis, trials: Sequence[Trial]) -> tuple[list[Trial], float]:
-    """Of several trials those of laws that go before a curve, and if they explain which fraction of what it does.
+    """Of several trials those of laws that go before a curve, and the fraction of what it explains that they must.
 
-    Functions of a robot's state resemble one another along a motion; what has a clock of its own resembles no law of
+    Functions of a robot's state resemble one another along a motion; what is periodic in time resembles no law of
     another family.
     """
     places = set(curve.places)
     laws = [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
-    if curve.effect is not FreeTorquePeriodic:
-        return laws, rules.law
-    return [t for t in laws if family_of(t.hypothesis.effect) == family_of(curve.effect)], rules.law_of_clock
+    if issubclass(curve.effect, FreeCurve) and curve.effect.periodic:
+        return [t for t in laws if family_of(t.hypothesis.effect) == family_of(curve.effect)], rules.law_if_periodic
+    return laws, rules.law
 
 
 def is_hopeless(rules: Selection, hypothesis: Hypothesis, best: Hypothesis, tried: int) -> bool:

@@ -172,6 +172,7 @@ class FreeCurve(Effect):
     ----------------
     variable, variable_unit : in a sentence, and on an axis.
     amount, article : what the curve gives, and how a sentence about it begins.
+    periodic : whether it repeats in time, with a frequency of its own as its last number.
     """
 
     usual: ClassVar[bool] = False
@@ -181,6 +182,7 @@ class FreeCurve(Effect):
     variable_unit: ClassVar[str] = ""
     amount: ClassVar[str] = "torque"
     article: ClassVar[str] = "a "
+    periodic: ClassVar[bool] = False
     first_mode: ClassVar[int] = 0
     """Which of the modes over a range is the first that it has."""
 
@@ -435,6 +437,7 @@ class FreeTorquePeriodic(FreeTorque):
     title: ClassVar[str] = "torque that is periodic in time"
     variable: ClassVar[str] = "phase"
     variable_unit: ClassVar[str] = "1"
+    periodic: ClassVar[bool] = True
     held: ClassVar[tuple[str, ...]] = ("frequency",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("external_disturbance", "its edges"),)
     kinds: ClassVar[tuple[Kind, ...]] = (
