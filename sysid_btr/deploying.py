@@ -271,7 +271,7 @@ def _of_outcome(outcome: Fit | Closing | Posterior) -> _Found:
     draws = outcome.sample.flat if isinstance(outcome, Posterior) else None
     entries = tuple(clean(e.to_dict()) for e in outcome.estimates)
     return _Found(
-        known.study.robot.for_log(log), log, known.written, known.study.numerics, entries, outcome.covariance, draws
+        known.study.robot.for_log(log), log, known.model, known.study.numerics, entries, outcome.covariance, draws
     )
 
 

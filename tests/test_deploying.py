@@ -163,7 +163,7 @@ def identified_arm(tmp_path: Path, expressions: list[str], values: list[float], 
     (tmp_path / "arm.xml").write_text(ARM)
     study = make_study(load_robot(str(tmp_path / "arm.xml")), [arm_log()], numerics=numerics, threads=1)
     terms = parse_parameters(expressions, study.robot, study.scales)
-    return Identified(study, Model.of(terms, values), (), ())
+    return Identified(study, Model.of(terms, values), ())
 
 
 def test_an_arm_with_other_names_gears_and_effects_moves_as_replayed(tmp_path: Path) -> None:
@@ -266,7 +266,7 @@ def test_a_model_for_a_step_fits_best_in_it(tmp_path: Path) -> None:
     there = own.study.train_problem(own.model)
     foreign, native = there.loss(np.stack([exact.values, own.values]))
     assert native < 0.9 * foreign
-    written = save_model(Folder(tmp_path), draft(Identified(own.study, own.model, own.estimates, ())))
+    written = save_model(Folder(tmp_path), draft(Identified(own.study, own.model, own.estimates)))
     assert written["reproduces"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     assert (model.opt.timestep, model.opt.integrator) == (0.01, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)

@@ -172,7 +172,7 @@ def test_an_effect_that_is_in_no_library_is_not_given_a_name() -> None:
     assert found.effects == ()
     assert found.signature is not None
     # what is reported is what is written
-    written = identified(found).written
+    written = identified(found).model
     assert {p.name: p.value for p in found.parameters} == dict(zip(written.terms.names, written.values, strict=True))
     assert found.after == found.before
 

@@ -169,7 +169,7 @@ def test_the_grammar_frees_a_curve_at_a_joint_over_what_the_joint_does() -> None
 def test_a_parameter_file_holds_the_range_of_a_curve(cls: type[FreeCurve], tmp_path: Path) -> None:
     term = at_knee(cls)
     model = Model.of([term], term.neutral + 0.1 * term.parameters[0].scale)
-    (tmp_path / "params.json").write_text(json.dumps(params_of(Identified(STUDY, model, (), ()))))
+    (tmp_path / "params.json").write_text(json.dumps(params_of(Identified(STUDY, model, ()))))
     read = read_params(tmp_path / "params.json", ROBOT).model
     assert read.terms[0].ranges == term.ranges
     np.testing.assert_array_equal(read.values, model.values)
@@ -179,7 +179,7 @@ def test_a_model_file_says_in_words_which_curve_it_does_not_hold() -> None:
     term = at_knee(FreeTorquePosition)
     x = np.linspace(*term.ranges[0], 50)
     amounts = fitted(term, x, 0.2 + 0.0 * x)
-    text = draft(Identified(STUDY, Model.of([term], amounts), (), ())).text().decode()
+    text = draft(Identified(STUDY, Model.of([term], amounts), ())).text().decode()
     assert (
         "Not in this file: free_torque (position) of knee: about 0.2 Nm everywhere: a law of every time step." in text
     )

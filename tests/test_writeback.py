@@ -24,7 +24,6 @@ from sysid_btr.diagnosis.closing import Closing
 from sysid_btr.display.changes import change_lines, fidelity, model_lines
 from sysid_btr.errors import UsageError
 from sysid_btr.identify.fit import fit
-from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
@@ -146,7 +145,7 @@ def study_of(robot: Robot, numerics: Numerics = NUMERICS, log: Log | None = None
 
 
 def model_of(study: Study, terms: Sequence[Term], values: Sequence[float]) -> Identified:
-    return Identified(study, Model.of(terms, values), (), ())
+    return Identified(study, Model.of(terms, values), ())
 
 
 def declared(path: Path, expressions: Sequence[str], values: Sequence[float], **options: Any) -> Identified:
@@ -642,13 +641,8 @@ def test_every_change_is_told_in_a_line(fitted: Any, out: Folder) -> None:
 
 
 def test_a_file_that_holds_less_than_the_fit_says_what_that_costs() -> None:
-    written = {"reproduces": False, "loss": {"holdout": 993.0}, "reported_loss": {"holdout": 100.0}, "not_told": []}
+    written = {"reproduces": False, "loss": {"holdout": 993.0}, "reported_loss": {"holdout": 100.0}}
     assert fidelity(written) == "reloaded, its loss on held-out data is 9.93 times the reported one"
-    held = fidelity({**written, "not_told": ["mass:link1"]})
-    assert held == (
-        "reloaded, with what is not identifiable left at nominal, "
-        "its loss on held-out data is 9.93 times the reported one"
-    )
     assert fidelity({**written, "loss": {"holdout": None}}) == "reloaded, its replay diverges"
 
 
@@ -738,24 +732,11 @@ def test_parameter_files_that_do_not_fit_are_refused(own: Path, out: Folder) -> 
         read_params(out.write("params.json", '{"schema": "x"}'), load_robot(str(own)))
 
 
-def test_what_a_log_cannot_tell_stays_nominal(own: Path) -> None:
-    model = declared(own, ["kp:hip", "mass:knee"], [1.1, 1.2])
-    told = ("yes", "no")
-    estimates = tuple(
-        Estimate(p.name, p.unit, p.nominal, v, 0.1, (v - 0.2, v + 0.2), (p.lower, p.upper), t, False, "")  # type: ignore[arg-type]
-        for p, v, t in zip(model.model.terms.parameters, model.model.values, told, strict=True)
-    )
-    held = replace(model, estimates=estimates, held_back=("mass:knee",))
-    made: Draft = draft(held)
-    assert {c.attribute for c in made.changes} == {"timestep", "integrator", "kp"}
-
-
-def test_a_fit_that_holds_back_says_so(fitted: Any) -> None:
-    blind = replace(fitted.estimates[0], identifiable="no", value=fitted.values[0])
+def test_the_model_written_is_the_model_reported(fitted: Any) -> None:
+    # a fit fixes at nominal what it can without loss: what it leaves elsewhere, the motion needs
+    blind = replace(fitted.estimates[0], identifiable="no")
     model = identified(replace(fitted, estimates=(blind, *fitted.estimates[1:])))
-    assert model.held_back == (blind.name,)
-    assert model.written.values[0] == 1.0
-    np.testing.assert_array_equal(model.written.values[1:], fitted.values[1:])
+    np.testing.assert_array_equal(model.model.values, fitted.values)
 
 
 def test_effects_that_were_not_named_are_not_written(fitted: Any) -> None:
@@ -779,7 +760,7 @@ def test_effects_that_were_not_named_are_not_written(fitted: Any) -> None:
     )
     model = identified(closing)
     assert model.model.terms == fitted.model.terms
-    np.testing.assert_array_equal(model.written.values, fitted.values)
+    np.testing.assert_array_equal(model.model.values, fitted.values)
     assert [e.value for e in model.estimates] == list(fitted.values)
 
 

@@ -81,7 +81,7 @@ def join_effects(
         from sysid_btr.result import to_json
         from sysid_btr.writeback.write import Identified, params_of
 
-        folder.write(params.name, to_json(params_of(Identified(study, joined.model, (), ()))))
+        folder.write(params.name, to_json(params_of(Identified(study, joined.model, ()))))
     summary = {"message": joined.message, "named": joined.model is not None, "simulations": joined.simulations}
     folder.write(kept.name, json.dumps(summary, indent=1) + "\n")
     return _read(summary, params, stage.world.robot)

@@ -85,8 +85,6 @@ def model_lines(result: Mapping[str, Any]) -> Iterator[str]:
     for part in written["not_in_file"]:
         word = "not in it" if part["held"] == "no" else "not quite in it"
         yield f"  {word}: {part['text']}: {part['how']}{_cost(part, written)}"
-    if written["not_told"]:
-        yield f"  left at nominal, not identifiable from this log: {', '.join(written['not_told'])}"
 
 
 def fidelity(written: Mapping[str, Any]) -> str:
@@ -96,8 +94,7 @@ def fidelity(written: Mapping[str, Any]) -> str:
         return "reloaded, it moves as reported"
     if own is None or reported is None or reported == 0:
         return "reloaded, its replay diverges"
-    held = "with what is not identifiable left at nominal, " if written["not_told"] else ""
-    return f"reloaded, {held}its loss on held-out data is {own / reported:.4g} times the reported one"
+    return f"reloaded, its loss on held-out data is {own / reported:.4g} times the reported one"
 
 
 def _cost(part: Mapping[str, Any], written: Mapping[str, Any]) -> str:

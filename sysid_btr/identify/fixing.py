@@ -39,29 +39,31 @@ def fix_unidentifiable(
     """
     if known is not None:
         blind = np.array([e.identifiable == "no" for e in found])
-        if not blind.any() or blind.all():
+        if not blind.any():
             return values, found, 0
         values = np.where(blind, [e.nominal for e in found], values)
         values[known.which] = known.beside(np.flatnonzero(blind), values)
         values = np.clip(values, problem.lower, problem.upper)
         return values, _fixed(values, found, blind), 0
     blind = fewest_to_fix(jacobian, found)
-    if not blind.any() or blind.all():
+    if not blind.any():
         return values, found, 0
     change = np.array([e.nominal for e in found]) - values
     change[~blind] = -np.linalg.lstsq(jacobian[:, ~blind], jacobian[:, blind] @ change[blind], rcond=1e-6)[0]
     start = np.clip(values + change, problem.lower, problem.upper)
-    conditional = Conditional(problem, ~blind, start)
-    result = LeastSquares(confirm=False, least_gain=ENOUGH).fit(
-        conditional, rng=np.random.default_rng(0), budget=budget or Budget(), journal=Journal(), progress=silent
-    )
-    if result.termination is Termination.INTERRUPTED:
-        raise KeyboardInterrupt
-    complete = conditional.complete(result.x[None])[0]
+    complete, spent = start, 2
+    if not blind.all():
+        conditional = Conditional(problem, ~blind, start)
+        result = LeastSquares(confirm=False, least_gain=ENOUGH).fit(
+            conditional, rng=np.random.default_rng(0), budget=budget or Budget(), journal=Journal(), progress=silent
+        )
+        if result.termination is Termination.INTERRUPTED:
+            raise KeyboardInterrupt
+        complete, spent = conditional.complete(result.x[None])[0], result.evaluations + 2
     free_loss, fixed_loss = problem.loss(np.stack([values, complete]))
     if not fixed_loss <= free_loss * WORSE:
-        return values, found, result.evaluations + 2
-    return complete, _fixed(complete, found, blind), result.evaluations
+        return values, found, spent
+    return complete, _fixed(complete, found, blind), spent
 
 
 def _fixed(values: FloatArray, found: tuple[Estimate, ...], blind: BoolArray) -> tuple[Estimate, ...]:

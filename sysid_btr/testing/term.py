@@ -238,7 +238,7 @@ def check_shared(cls: type[Term], bench: TermBench) -> None:
 def check_written(cls: type[Term], bench: TermBench) -> None:
     """A written model, read again, moves the same; or the file and the result say what is not in it."""
     for term, case in bench.forms(cls):
-        identified = Identified(bench.study, Model.of([term], case), (), ())
+        identified = Identified(bench.study, Model.of([term], case), ())
         with tempfile.TemporaryDirectory() as folder:
             written = save_model(Folder(Path(folder)), draft(identified))
             text = (Path(folder) / str(written["path"])).read_text(encoding="utf-8")

@@ -49,21 +49,11 @@ class Identified:
     study : robot, logs, numerics.
     model : the terms and their values.
     estimates : of its parameters, in order.
-    held_back : names of parameters that are not identifiable and that stay at their nominal value although the
-        search had moved them.
     """
 
     study: Study
     model: Model
     estimates: tuple[Estimate, ...]
-    held_back: tuple[str, ...]
-
-    @property
-    def written(self) -> Model:
-        """The model as it is written."""
-        known = {e.name: e for e in self.estimates}
-        pairs = zip(self.model.terms.names, self.model.values, strict=True)
-        return self.model.at(np.array([known[n].nominal if n in self.held_back else v for n, v in pairs]))
 
     def estimates_of(self, term: Term) -> tuple[Estimate, ...]:
         """Estimates of a term's own parameters; none of a term that is not in the model, or where there are none."""
@@ -81,14 +71,7 @@ def identified(outcome: Fit | Closing) -> Identified:
         estimates = (*outcome.parameters, *(p for e in outcome.effects for p in e.parameters))
     else:
         model, estimates = outcome.before_model, outcome.parameters
-    held_back = tuple(
-        e.name
-        for term in model.terms
-        if term.declared
-        for e, v in zip(estimates[model.terms.columns(term)], model.own(term), strict=True)
-        if e.identifiable == "no" and v != e.nominal
-    )
-    return Identified(outcome.study, model, estimates, held_back)
+    return Identified(outcome.study, model, estimates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +137,7 @@ def draft(model: Identified) -> Draft:
 
 def _parts(model: Identified) -> tuple[Part, ...]:
     robot = model.study.robot.for_log(model.study.train[0].log)
-    return make_parts(robot, model.written, model.study.numerics)
+    return make_parts(robot, model.model, model.study.numerics)
 
 
 def _draft_in(source: Source, model: Identified, robot: Robot, target: Target) -> Draft:
@@ -258,7 +241,6 @@ def save_model(folder: Folder, made: Draft) -> dict[str, Any]:
         "reported_loss": asdict(reported),
         "reproduces": alone and own.close_to(reported),
         "not_in_file": missing,
-        "not_told": list(made.identified.held_back),
     }
 
 
@@ -299,7 +281,7 @@ def params_of(model: Identified) -> dict[str, Any]:
     """Content of ``params.json``: every parameter as it is written, with all that is known of it."""
     held = {id(part.term): part.held for part in _parts(model)}
     entries = []
-    for term, own in model.written.parts:
+    for term, own in model.model.parts:
         known = model.estimates_of(term) or (None,) * len(own)
         entries.append(
             {
