@@ -92,6 +92,18 @@ def scores(rmse: float) -> Scores:
     return Scores({"position": channel}, {"position": channel})
 
 
+LEFT = {
+    "joint": "<hinge>",
+    "share": np.float64(0.97),
+    "torque_rms": 0.41,
+    "torque_noise": 0.115,
+    "unit": "Nm",
+    "periodic": None,
+    "dependence": [{"on": "position_and_direction", "share": 0.94}, {"on": "position:knee", "share": 0.002}],
+}
+"""Of what is left, as `diagnosis.signature` has it of a joint."""
+
+
 def closing(study: Study, **changes: object) -> Closing:
     effect = NamedEffect(
         effect="coulomb_friction",
@@ -120,7 +132,7 @@ def closing(study: Study, **changes: object) -> Closing:
         "effects": (effect,),
         "candidates": (Candidate("coulomb_friction", ("hinge",), 0.9, math.nan, ()),),
         "steps": (StepRecord((), (), 44.0, 45.0), StepRecord(("coulomb_friction at hinge",), (), 1.0, 1.1)),
-        "signature": {"period": np.float64(1.7), "joints": ["hinge"]},
+        "signature": {"summary": "a torque at hinge, a function of the velocity", "joints": [LEFT]},
         "before_model": Model.of(()),
         "model": Model.of(()),
         "replays": 12,
@@ -229,7 +241,7 @@ def test_exit_code_tells_a_finding_from_a_failure(study: Study) -> None:
 def test_the_report_holds_every_finding_and_escapes_names(study: Study, verdict: str) -> None:
     result = closing(study, verdict=verdict, message="a <b>bold</b> claim").to_dict()
     page = render(result, [Picture("overlay", "how to read it", b"light", b"dark")])
-    for text in ("mass:arm", "hardly any sensor responds", "coulomb_friction", "stribeck_friction"):
+    for text in ("mass:arm", "hardly any sensor responds", "coulomb_friction", "stribeck_friction", "direction 94 %"):
         assert text in page
     assert "<b>" not in page
     assert "dry friction at &lt;hinge&gt;" in page
@@ -252,8 +264,12 @@ def test_tables_name_effect_interval_and_reason(study: Study, capsys: pytest.Cap
         "hardly any sensor",
         "0.280 .. 0.320",
         "mrad",
+        "left at joint",
+        "0.115 Nm",
+        "position and direction 94 %",
     ):
         assert part in text
+    assert "None" not in text
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PLAIN_WIDTH = 118
 """Columns where the output is no terminal, so that what is piped does not depend on a window."""
-CANDIDATES_SHOWN, EXACT_SHOWN = 6, 4
+CANDIDATES_SHOWN, EXACT_SHOWN, PREDICTORS_SHOWN = 6, 4, 3
 PARTS = (("train", "fitted"), ("holdout", "held-out"))
 HELD_OUT = "held out"
 RECORDED = (
@@ -24,7 +24,7 @@ RECORDED = (
     "(others: --for INTEGRATOR:STEP)"
 )
 MENTIONED = 0.01
-"""Probability from which another cause is mentioned."""
+"""Probability from which another cause is mentioned, and share from which a predictor is."""
 
 
 class Finding(Protocol):
@@ -92,7 +92,10 @@ def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]
     elif result.get("verdict") in ("ambiguous", "partly_explained", "unexplained") and result.get("candidates"):
         yield candidates_table(result["candidates"][:CANDIDATES_SHOWN])
     if result.get("signature"):
-        yield Text("residual: " + ", ".join(f"{k} {compact(v)}" for k, v in result["signature"].items()))
+        # in words it stands in the message
+        rows = residual_rows(result["signature"])
+        if rows:
+            yield residual_table(rows)
     for p in result.get("profiles", []):
         ends = zip(p["ci95"], p["closed"], strict=True)
         low, high = (number(end) + ("" if closed else " (not closed)") for end, closed in ends)
@@ -267,6 +270,35 @@ def tried_table(candidates: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
+RESIDUAL = ("joint", "share", "rms", "noise", "predicted by, on stretches left out")
+"""Head of the table of what is left."""
+
+
+def residual_rows(signature: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Of each joint's missing torque: its share of what is left, size, noise, and what predicts it, the best first."""
+    rows = []
+    for joint in signature["joints"]:
+        predicts = [
+            f"{d['on'].replace('_', ' ').replace(':', ' of ')} {100 * d['share']:.0f} %"
+            for d in joint["dependence"][:PREDICTORS_SHOWN]
+            if d["share"] >= MENTIONED
+        ]
+        sizes = (f"{number(joint[key], 3)} {joint['unit']}" for key in ("torque_rms", "torque_noise"))
+        known = ", ".join(predicts) or "none of what was tried"
+        rows.append((joint["joint"], f"{100 * joint['share']:.0f} %", *sizes, known))
+    return rows
+
+
+def residual_table(rows: Sequence[Sequence[str]]) -> Table:
+    """The torque that a model lacks, by joint."""
+    table = _table(f"left at {RESIDUAL[0]}")
+    for name in RESIDUAL[1:]:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
 def problems_table(problems: Sequence[Finding]) -> Table:
     """What is wrong with a log."""
     table = _table("")
@@ -296,17 +328,6 @@ def identifiability(parameter: Mapping[str, Any]) -> str:
 def number(value: float | None, digits: int = 4) -> str:
     """A number in a table."""
     return "-" if value is None else f"{value:.{digits}g}"
-
-
-def compact(value: Any) -> str:
-    """A value of a signature in a line of text."""
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    if isinstance(value, Mapping):
-        return "(" + ", ".join(f"{k} {compact(v)}" for k, v in value.items()) + ")"
-    if isinstance(value, list | tuple):
-        return ", ".join(compact(v) for v in value)
-    return str(value)
 
 
 def _table(first: str) -> Table:

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 from sysid_btr.display.changes import model_lines
 from sysid_btr.display.pages import templates
 from sysid_btr.display.text import (
+    RESIDUAL,
     certainty_words,
     channel_scores,
-    compact,
     episode_words,
     exactness,
     identifiability,
     number,
+    residual_rows,
     stages,
     tabled_estimates,
 )
@@ -134,12 +135,13 @@ def environment() -> Environment:
         si=si,
         number=number,
         identifiability=identifiability,
-        compact=compact,
+        residual_rows=residual_rows,
         digits=with_digits_of,
         certainty=certainty_words,
         count=_count,
         breakable=_breakable,
     )
+    made.globals["residual_head"] = RESIDUAL
     return made
 
 
