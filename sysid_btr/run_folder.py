@@ -6,6 +6,7 @@ import os
 import secrets
 import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -28,12 +29,17 @@ LOCK = ".lock"
 class Lock:
     """A folder held by this process, for as long as this object lives; the system frees it if the process dies."""
 
-    def __init__(self, folder: Path, file: IO[str]) -> None:
-        self._free = finalize(self, _free, folder / LOCK, file)
+    def __init__(self, folder: Path, file: IO[str], made: bool) -> None:
+        self._free = finalize(self, _free, folder / LOCK, file, made)
 
     @classmethod
-    def take(cls, folder: Path) -> Lock | None:
+    def take(cls, folder: Path, *, made: bool = False) -> Lock | None:
         """Hold a folder; None where the system has no such locks, or this process holds it already.
+
+        Parameters
+        ----------
+        folder : that exists.
+        made : whether it was made for this, so that it goes again where nothing was written to it.
 
         Raises
         ------
@@ -62,11 +68,11 @@ class Lock:
             return None
         if not _is_there(folder / LOCK, file):  # its holder ended between the two calls above
             file.close()
-            return cls.take(folder)
+            return cls.take(folder, made=made)
         file.truncate(0)
         file.write(f"{_process()} since {datetime.now():%Y-%m-%d %H:%M:%S}")
         file.flush()
-        return cls(folder, file)
+        return cls(folder, file, made)
 
 
 def _process() -> str:
@@ -80,9 +86,12 @@ def _is_there(path: Path, file: IO[str]) -> bool:
         return False
 
 
-def _free(path: Path, file: IO[str]) -> None:
+def _free(path: Path, file: IO[str], made: bool) -> None:
     path.unlink(missing_ok=True)
     file.close()
+    if made:
+        with suppress(OSError):  # it holds something
+            path.parent.rmdir()
 
 
 def relative(path: str | Path, folder: Path) -> str:
@@ -171,9 +180,9 @@ class Folder:
         return target
 
 
-def _locked(path: Path) -> Lock | None:
+def _locked(path: Path, *, made: bool) -> Lock | None:
     try:
-        return Lock.take(path)
+        return Lock.take(path, made=made)
     except OSError as error:
         raise UsageError(f"--out {path} cannot be written: {error.strerror}; choose another folder") from error
 
@@ -183,7 +192,7 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
 
     Parameters
     ----------
-    path : folder; created with its parents.
+    path : folder; created with its parents, and removed again if the run ends before it has written anything there.
     resume : go on with the journal of an earlier run.
     overwrite : replace what an earlier run left: its journal now, its results once there are new ones.
 
@@ -196,11 +205,12 @@ def open_folder(path: Path, *, resume: bool = False, overwrite: bool = False) ->
         raise UsageError("--resume continues the run that is there and --overwrite deletes it: give one of the two")
     if path.exists() and not path.is_dir():
         raise UsageError(f"--out {path} is a file; give a folder")
+    made = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {path} cannot be created: {error.strerror}; choose another folder") from error
-    folder = Folder(path, _locked(path))
+    folder = Folder(path, _locked(path, made=made))
     if folder.held and not (resume or overwrite):
         raise UsageError(
             f"--out {path} already holds results ({', '.join(folder.held)}), which are not touched: --resume "

@@ -389,6 +389,21 @@ def test_a_folder_that_another_process_writes_is_refused_until_that_ends(cli: Cl
     assert answer.code == 0, answer.err
 
 
+@pytest.mark.parametrize("there", [False, True])
+def test_a_run_that_cannot_start_leaves_the_folders_as_they_were(
+    cli: Cli, bench: Path, tmp_path: Path, there: bool
+) -> None:
+    out = tmp_path / "runs" / "first"
+    if there:
+        out.mkdir(parents=True)
+    answer = cli(
+        "fit", "--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--fit", "mass:nowhere", "--out", out
+    )
+    assert answer.code == 2
+    assert "nowhere" in answer.err
+    assert out.exists() is there
+
+
 def test_close_without_fit_says_what_it_fits(cli: Cli, bench: Path) -> None:
     asked = ("--model", bench / "arm.xml", "--log", bench / "arm.parquet", "--effects", "coulomb_friction")
     answer = cli("close", *asked)
