@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -143,7 +144,10 @@ def test_a_mistake_is_told_with_what_to_do(
 
 def test_bounds_of_fields_and_parameters_that_exist_are_taken(cli: Cli) -> None:
     for bounds in ("mass=0.5:2", "mass:arm=0.5:2", "mass:*=0.5:2", "com.x:arm=-0.1:0.1"):
-        assert cli("fit", *ASKED, "--bounds", bounds).code == 0
+        answer = cli("fit", *ASKED, "--bounds", bounds, "--json")
+        assert answer.code == 0
+        if bounds.startswith("mass"):
+            assert {tuple(p["bounds"]) for p in json.loads(answer.out)["parameters"]} == {(0.5, 2.0)}
 
 
 def test_a_file_that_is_no_result_and_a_run_that_has_not_ended_are_told_apart(cli: Cli, tmp_path: Path) -> None:

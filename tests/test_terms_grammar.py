@@ -176,12 +176,24 @@ def test_the_papers_search_space() -> None:
     assert other.parameters[0].upper == 3.0
 
 
-@pytest.mark.parametrize("key", ["damping:arm", "damping"])
+@pytest.mark.parametrize("key", ["damping:arm", "damping", "damping:*", "damping:leg,a*"])
 def test_a_robots_own_bounds_win(key: str) -> None:
     robot = replace(pendulum(), bounds={key: (0.01, 0.2)})
     scales: dict[str, JointScale] = {"arm": SCALE}
     (term,) = parse_parameters(["damping:arm"], robot, scales)
     assert (term.parameters[0].lower, term.parameters[0].upper) == (0.01, 0.2)
+
+
+def test_of_bounds_the_closest_holds() -> None:
+    table = {"mass": (0.1, 2.0), "mass:*": (0.2, 3.0), "mass:*Pitch": (0.3, 4.0), "mass:LHipPitch": (0.4, 5.0)}
+    freed = ("mass:LHipPitch", "mass:RHipPitch", "mass:Torso", "kp:LHipPitch")
+    terms = parse_parameters(freed, replace(NAO, bounds=table))
+    named, ends, rest, other = (term.parameters[0] for term in terms)
+    assert [p.lower for p in (named, ends, rest)] == [0.4, 0.3, 0.2]
+    assert not other.stated
+    (alike,) = parse_parameters(["mass:*Pitch=shared"], replace(NAO, bounds={"mass:*Pitch": (0.3, 4.0)}))
+    assert alike.parameters[0].lower == 0.3
+    assert alike.parameters[0].stated
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,10 @@ class ParameterOptions(Options):
         decides=True,
     )
     bounds: Ranges = option(
-        {}, "Bounds of a parameter or of a whole field, e.g. kp=0.5:2.", metavar="NAME=LOW:HIGH", decides=True
+        {},
+        "Bounds of a parameter, of all that a glob names or of a whole field, e.g. kp=0.5:2.",
+        metavar="NAME=LOW:HIGH",
+        decides=True,
     )
 
 

@@ -39,7 +39,7 @@ class Robot:
     make_spec : builds a fresh, editable MjSpec.
     path : the file it came from, if any.
     digest : SHA-256 of the compiled-from XML.
-    bounds : parameter or ``FIELD`` -> (lower, upper), over the defaults of the grammar.
+    bounds : parameter, glob or ``FIELD`` -> (lower, upper), over the defaults of the grammar.
     priors : parameter, glob or ``FIELD`` -> prior as text, such as ``normal(1, 0.1)``, for posteriors.
     tied : groups of joints driven by one motor; their gains are one parameter.
     always : terms without parameters of their own that belong to the robot (drive electronics).

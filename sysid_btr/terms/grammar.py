@@ -210,7 +210,14 @@ def _possible(name: str, kind: Kind, stated: tuple[float, float]) -> tuple[float
 def _own_bounds(
     name: str, field: str, place: str, table: Mapping[str, tuple[float, float]]
 ) -> tuple[float, float] | None:
-    for key in (name, f"{field}:{place}", name.partition(":")[0], field):
-        if key in table:
-            return table[key]
-    return None
+    """Of what matches a parameter: its name wins over a glob, and that over the field; of several globs the last."""
+    fields = name.partition(":")[0], field
+    names = name, f"{field}:{place}"
+    globs = [key for key in table if _matches(key, fields, place) and key not in names]
+    return next((table[key] for key in (*names, *reversed(globs), *fields) if key in table), None)
+
+
+def _matches(key: str, fields: Sequence[str], place: str) -> bool:
+    """Whether ``FIELD:GLOB[,GLOB...]`` names a place of one of these fields."""
+    own, _, globs = key.partition(":")
+    return own in fields and any(fnmatch.fnmatchcase(place, glob) for glob in globs.split(","))
