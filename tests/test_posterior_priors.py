@@ -54,6 +54,8 @@ def test_a_name_wins_over_a_glob_and_that_over_a_field() -> None:
     assert choose_priors(PARAMETERS, given) == (Normal(1, 0.1), Normal(1, 0.2), Uniform())
     # a name may look like a glob
     assert choose_priors(PARAMETERS, {"kp:*": "normal(2, 1)"})[2] == Normal(2, 1)
+    several = choose_priors(PARAMETERS, {"mass:*ee,H*": "normal(1, 0.1)", "mass:Kn*": "normal(1, 0.2)"})
+    assert several == (Normal(1, 0.2), Normal(1, 0.1), Uniform())
 
 
 def test_the_robots_table_gives_way_and_may_name_what_is_not_free() -> None:

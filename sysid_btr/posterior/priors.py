@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.terms.base import Parameter
+from sysid_btr.terms.grammar import closest
 
 _POINTS = 4001
 
@@ -131,13 +131,13 @@ def choose_priors(
             parsed[key] = parse_prior(text)
         except UsageError as error:
             problems.append(f"{key}: {error}")
-        if not any(_rank(key, p.name) for p in parameters):
+        if all(closest({key: text}, p.name) is None for p in parameters):
             names = ", ".join(p.name for p in parameters)
             problems.append(f"{key} is not a fitted parameter; available: {names}")
     own = {key: parse_prior(text) for key, text in (table or {}).items()}
     chosen: list[Prior] = []
     for parameter in parameters:
-        prior = _closest(parsed, parameter.name) or _closest(own, parameter.name) or Uniform()
+        prior = closest(parsed, parameter.name) or closest(own, parameter.name) or Uniform()
         if not np.isfinite(_on_grid(prior, parameter.lower, parameter.upper)[1]).any():
             problems.append(f"{parameter.name}: {prior} has no mass within {parameter.lower:g} to {parameter.upper:g}")
         chosen.append(prior)
@@ -161,21 +161,6 @@ def log_prior(priors: Sequence[Prior], x: FloatArray) -> FloatArray:
     for j, prior in enumerate(priors):
         total += prior.log_density(x[:, j])
     return total
-
-
-def _closest(priors: Mapping[str, Prior], name: str) -> Prior | None:
-    ranked = [(_rank(key, name), i, prior) for i, (key, prior) in enumerate(priors.items())]
-    best = max((r for r in ranked if r[0]), key=lambda r: r[:2], default=None)
-    return None if best is None else best[2]
-
-
-def _rank(key: str, name: str) -> int:
-    """How closely a key names a parameter; 0 if not at all."""
-    if key == name:
-        return 3
-    if fnmatchcase(name, key):
-        return 2
-    return int(name.partition(":")[0] == key)
 
 
 def _on_grid(prior: Prior, lower: float, upper: float) -> tuple[FloatArray, FloatArray]:

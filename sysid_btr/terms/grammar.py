@@ -6,7 +6,7 @@ import difflib
 import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from sysid_btr.errors import UsageError
 from sysid_btr.mujoco_conventions import SLIDE
@@ -16,6 +16,8 @@ from sysid_btr.terms.scales import Scales, largest_scale
 
 if TYPE_CHECKING:
     import mujoco
+
+T = TypeVar("T")
 
 
 class Robot(Protocol):
@@ -176,7 +178,7 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
     free = [k for k, v in zip(kinds, fixed, strict=True) if v is None] if fixed else kinds
     known = []
     for parameter, kind in zip(term.parameters, free, strict=True):
-        stated = _own_bounds(parameter.name, term.called, places[0], robot.bounds)
+        stated = closest(robot.bounds, parameter.name, f"{term.called}:{places[0]}")
         bounds = _possible(parameter.name, kind, stated) if stated else (kind.lower, kind.upper)
         named = f"{parameter.name.partition(':')[0]}:{label}"
         kind = term.in_units_of(kind, slide=_slides(model, places[0]))
@@ -207,17 +209,24 @@ def _possible(name: str, kind: Kind, stated: tuple[float, float]) -> tuple[float
     return stated
 
 
-def _own_bounds(
-    name: str, field: str, place: str, table: Mapping[str, tuple[float, float]]
-) -> tuple[float, float] | None:
-    """Of what matches a parameter: its name wins over a glob, and that over the field; of several globs the last."""
-    fields = name.partition(":")[0], field
-    names = name, f"{field}:{place}"
-    globs = [key for key in table if _matches(key, fields, place) and key not in names]
-    return next((table[key] for key in (*names, *reversed(globs), *fields) if key in table), None)
+def closest(table: Mapping[str, T], *names: str) -> T | None:
+    """What a table says of a parameter: under its name, else under the last glob that matches, else under its field.
+
+    Parameters
+    ----------
+    table : keys are names, ``FIELD:GLOB[,GLOB...]`` or ``FIELD``.
+    names : all that the parameter is called, ``FIELD:PLACE`` each; the first goes before the others.
+
+    Returns
+    -------
+    value or None
+        None where nothing is said of it.
+    """
+    globs = [key for key in reversed([*table]) if any(_matches(key, name) for name in names)]
+    fields = [name.partition(":")[0] for name in names]
+    return next((table[key] for key in (*names, *globs, *fields) if key in table), None)
 
 
-def _matches(key: str, fields: Sequence[str], place: str) -> bool:
-    """Whether ``FIELD:GLOB[,GLOB...]`` names a place of one of these fields."""
-    own, _, globs = key.partition(":")
-    return own in fields and any(fnmatch.fnmatchcase(place, glob) for glob in globs.split(","))
+def _matches(key: str, name: str) -> bool:
+    field, colon, globs = key.partition(":")
+    return any(fnmatch.fnmatchcase(name, f"{field}{colon}{glob}") for glob in globs.split(","))
