@@ -191,6 +191,9 @@ def test_of_bounds_the_closest_holds() -> None:
     named, ends, rest, other = (term.parameters[0] for term in terms)
     assert [p.lower for p in (named, ends, rest)] == [0.4, 0.3, 0.2]
     assert not other.stated
+    for key in ("kp:L*", "kp:R*", "kp:RHipYawPitch"):
+        (tied,) = parse_parameters(["kp:*HipYawPitch"], replace(NAO, bounds={key: (0.3, 4.0)}))
+        assert tied.parameters[0].stated, "joints that one motor drives have one number"
     (alike,) = parse_parameters(["mass:*Pitch=shared"], replace(NAO, bounds={"mass:*Pitch": (0.3, 4.0)}))
     assert alike.parameters[0].lower == 0.3
     assert alike.parameters[0].stated

@@ -178,7 +178,7 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
     free = [k for k, v in zip(kinds, fixed, strict=True) if v is None] if fixed else kinds
     known = []
     for parameter, kind in zip(term.parameters, free, strict=True):
-        stated = closest(robot.bounds, parameter.name, f"{term.called}:{places[0]}")
+        stated = closest(robot.bounds, parameter.name, *(f"{term.called}:{place}" for place in places))
         bounds = _possible(parameter.name, kind, stated) if stated else (kind.lower, kind.upper)
         named = f"{parameter.name.partition(':')[0]}:{label}"
         kind = term.in_units_of(kind, slide=_slides(model, places[0]))
