@@ -13,7 +13,7 @@ from sysid_btr.btr import learning
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.closing import join_effects
 from sysid_btr.btr.controllers import Controller, NaoGait
-from sysid_btr.btr.learning import Learnt, MapProblem, learn, learnt_once, model_fit, trial_study, usable_logs
+from sysid_btr.btr.learning import Learnt, learn, learnt_once, model_fit, trial_study, usable_logs
 from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise, Trial
 from sysid_btr.btr.task import Walk
@@ -21,6 +21,7 @@ from sysid_btr.btr.trials import Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import silent
+from sysid_btr.identify.prior import MapProblem
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import servo_joints
 from sysid_btr.simulation.numerics import Numerics
@@ -107,6 +108,9 @@ def test_what_was_believed_counts_as_much_as_it_is_known() -> None:
     class Line:
         def residuals(self, x: np.ndarray) -> np.ndarray:
             return np.where(np.isnan(x).any(axis=1, keepdims=True), np.nan, x[:, :1] - 3.0)
+
+        def loss(self, x: np.ndarray) -> np.ndarray:
+            return np.asarray(self.residuals(x)[:, 0] ** 2)
 
     rng = np.random.default_rng(0)
     root = rng.normal(size=(len(TRUTH), len(TRUTH)))

@@ -13,19 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.robot import Trial
 from sysid_btr.errors import LogError, ModelError, UsageError
-from sysid_btr.estimators.base import Budget, Derived, Estimator, Progress, Termination
+from sysid_btr.estimators.base import Budget, Estimator, Progress, Termination
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares, linearise
 from sysid_btr.identify.mode import Mode
+from sysid_btr.identify.prior import MapProblem
 from sysid_btr.identify.refit import Fitted, inflate, judge
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.models.robot import Robot
-from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.reading import parse_json
 from sysid_btr.run_folder import Folder
 from sysid_btr.terms.model import Model, Terms
@@ -36,31 +35,6 @@ for gaits."""
 TURNS, SETTLED = 4, 0.05
 """Times that states and numbers are found in turn, at most; and the change of what is left, as a fraction, below which
 another would move numbers by less than a tenth of their deviation."""
-
-
-@dataclass(frozen=True, eq=False)
-class MapProblem(Derived):
-    """Logs together with what was believed before them (maximum a posteriori).
-
-    Attributes
-    ----------
-    problem : of the logs.
-    belief : of the same parameters.
-    """
-
-    problem: ReplayProblem
-    belief: Belief
-
-    def residuals(self, candidates: FloatArray) -> FloatArray:
-        """Whitened residuals (m, r + p) of candidates (m, p); those of the belief come last."""
-        residuals = self.problem.residuals(candidates)
-        pull = self.belief.whitened(np.atleast_2d(candidates))
-        pull[np.isnan(residuals).any(axis=1)] = np.nan
-        return np.hstack([residuals, pull])
-
-    def loss(self, candidates: FloatArray) -> FloatArray:
-        """Sum of squared residuals (m,); NaN where a candidate diverged."""
-        return np.asarray(np.sum(self.residuals(candidates) ** 2, axis=1))
 
 
 def model_fit() -> LeastSquares:

@@ -92,7 +92,7 @@ def _linear(study: Study, model: Model, rules: Selection) -> tuple[ReplayProblem
     if study.procedure.wanders:
         study = _weighed(study, model)
     problem = shorten(study, rules.scan_seconds).train_problem(model)
-    return problem, *linearise(problem, model.values, step=study.stencil(model.terms))
+    return problem, *linearise(study.with_belief(problem), model.values, step=study.stencil(model.terms))
 
 
 def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensitivity], int]:
@@ -102,7 +102,7 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     asked = _perturbations(state, library, problem, residual)
     if study.procedure.costly and len(asked) > rules.glance_most:
         glance = shorten(study, rules.glance_seconds).train_problem(model)
-        linear = linearise(glance, model.values, step=study.stencil(model.terms))
+        linear = linearise(study.with_belief(glance), model.values, step=study.stencil(model.terms))
         seen = scan(glance, model.values, *linear, asked, study.scales, rules)
         asked = [s.perturbation for s in seen[: rules.glance_most]]
     # what is left is the right integrator's; what an effect would change may be a little off
@@ -134,6 +134,6 @@ def _perturbations(state: State, library: Library, problem: ReplayProblem, resid
     study = state.study
     places: dict[str, tuple[str, ...]] = {scope: study.robot.names(scope) for scope in get_args(Scope)}
     asked: list[Perturbation] = perturbations(library, places, study.scales)
-    asked += proposals(study, problem, problem.start, residual, library)
+    asked += proposals(study, problem, problem.start, residual[: problem.count], library)
     terms = state.fitted.model.terms
     return [q for q in asked if terms.admit(q.effect, q.places)]

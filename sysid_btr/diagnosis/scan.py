@@ -141,7 +141,7 @@ def scan(
     ----------
     problem : data and declared terms.
     values : (p,) fitted.
-    residual, jacobian : (r,) and (r, p) there, whitened.
+    residual, jacobian : (r,) and (r, p) there, whitened; at their end what is known of the parameters beside the data.
     asked : effects, places, working points.
     scales : sizes at the joints.
     rules : where costly perturbations are tried.
@@ -258,14 +258,17 @@ def _simulate(
                 candidates[row, columns[perturbation.effect, place]] = perturbation.probe[d]
     subtree_of_row = wide._subtrees[1]
     responses: dict[tuple[int, int], FloatArray | None] = {}
-    rows_of = {subtree: np.flatnonzero(subtree_of_row == subtree) for subtree in groups}
-    everywhere = np.arange(len(subtree_of_row))
+    everywhere = np.arange(len(residuals[0].basis))
+    # what is known of the parameters beside the log no effect moves, but all of them may spare the parameters
+    beside = everywhere[len(subtree_of_row) :]
+    rows_of = {s: np.concatenate([np.flatnonzero(subtree_of_row == s), beside]) for s in groups}
     asks = [[], *jobs]  # the first candidate asks nothing: the others are compared with it
     for first in range(0, len(candidates), BLOCK):
         block = wide.residuals(candidates[first : first + BLOCK])
         if first == 0:
             base = block[0].copy()
-        for change, job in zip(block - base, asks[first : first + BLOCK], strict=True):
+        changes = np.pad(block - base, ((0, 0), (0, len(beside))))
+        for change, job in zip(changes, asks[first : first + BLOCK], strict=True):
             for i, d in job:
                 rows = rows_of.get(_subtree(asked[i], where), everywhere)
                 finite = np.isfinite(change).all()

@@ -13,7 +13,7 @@ from sysid_btr.identify.deferred import cheaper
 from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fixing import fix_unidentifiable
-from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.intervals import estimates, held_to_model
 from sysid_btr.identify.nuisance import error_of_the_rest
 from sysid_btr.identify.refit import judge, refit
 from sysid_btr.identify.sensitivity import with_sensitivity
@@ -66,7 +66,9 @@ def with_intervals(state: State, rules: Selection) -> State:
     if known is None:
         near = cheaper(problem, study.cheap, model.values)
         found, _ = followed(problem.parameters, found, near, model.values, jacobian)
-    values, found, _ = fix_unidentifiable(problem, model.values, found, jacobian, known)
+    values, found, _ = fix_unidentifiable(study.with_belief(problem), model.values, found, jacobian, known)
+    if known is None and study.redundancy:
+        found = held_to_model(found, problem.parameters)
     found = with_sensitivity(found, problem, slopes)
     last = judge(study, model.at(values))
     fitted = last if known is None else state.fitted

@@ -235,6 +235,14 @@ def exactness(result: Mapping[str, Any]) -> Iterator[str]:
         )
     elif result.get("misfit"):
         yield "the model leaves more than noise, which the intervals do not account for"
+    held = [p for p in estimates_of(result) if p.get("prior_std")]
+    if held:
+        fields = ", ".join(dict.fromkeys(p["name"].partition(":")[0] for p in held))
+        share = number(100 * held[0]["prior_std"] / held[0]["nominal"], 2)
+        yield (
+            f"since the model leaves more than noise, {fields} was taken to be what the model states, give or take "
+            f"{share} % (one standard deviation); --bounds states otherwise"
+        )
     if allowed:
         sizes = ", ".join(f"{name} by {number(std)}" for name, std in allowed.items())
         yield f"intervals hold where what is not fitted is off: {sizes} (one standard deviation)"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,6 @@ from sysid_btr.identify.study import Study
 from sysid_btr.terms.base import Parameter
 from sysid_btr.terms.model import Model, Terms
 
-if TYPE_CHECKING:
-    from numpy.random import Generator
-
 GROWTH = 5.0
 """Factor by which a bound grows ..."""
 MOST = 3
@@ -30,28 +26,34 @@ AT = 1e-6
 """Of the range: an estimate nearer to a bound lies on it."""
 
 
-def grow_bounds(study: Study, at: Optimum, rng: Generator, budget: Budget, progress: Progress) -> tuple[Optimum, int]:
+def grow_bounds(study: Study, at: Optimum, budget: Budget, progress: Progress) -> tuple[Optimum, int]:
     """The optimum within bounds that are wide enough, and the evaluations that took.
 
     A bound that the user or the robot states stays, and so does one that physics sets.
     """
-    spent = 0
+    spent, rng = 0, np.random.default_rng(0)
     for _ in range(MOST):
         terms = grown(at.problem.terms, pressing(at))
         if terms is None:
             break
         problem = study.train_problem(Model(terms, at.values))
-        found = LeastSquares().fit(problem, rng=rng, budget=budget.after(spent), journal=Journal(), progress=progress)
+        goal, left = study.with_belief(problem), budget.after(spent)
+        found = LeastSquares().fit(goal, rng=rng, budget=left, journal=Journal(), progress=progress)
         spent += found.evaluations
         at = Optimum.of(problem, found, study.stencil(terms))
     return at, spent
 
 
+def on_bounds(model: Model) -> FloatArray:
+    """(p,) -1 and 1 where a value lies on its lower and upper bound; else 0."""
+    values, lower, upper = model.values, model.terms.lower, model.terms.upper
+    near = AT * (upper - lower)
+    return np.where(values >= upper - near, 1.0, np.where(values <= lower + near, -1.0, 0.0))
+
+
 def pressing(at: Optimum) -> FloatArray:
     """(p,) -1 and 1 where an estimate lies on its lower and upper bound and data want it beyond; else 0."""
-    lower, upper, blocks = at.problem.lower, at.problem.upper, at.problem.blocks
-    near = AT * (upper - lower)
-    side = np.where(at.values >= upper - near, 1.0, np.where(at.values <= lower + near, -1.0, 0.0))
+    blocks, side = at.problem.blocks, on_bounds(Model(at.problem.terms, at.values))
     for i in np.flatnonzero(side):
         pull = -at.jacobian[:, i] * at.residual
         error = np.sqrt(np.sum(np.bincount(blocks, pull) ** 2))

@@ -8,9 +8,12 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, Progress, silent
+from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.bounds import grow_bounds, on_bounds
 from sysid_btr.identify.numerics import Beginning, converged, held_numerics
 from sysid_btr.identify.recorder import as_recorded
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, nearby, refit, robust_refit, shorten
+from sysid_btr.identify.step_check import Optimum
 from sysid_btr.identify.study import Study
 from sysid_btr.identify.thresholds import with_reached_limits, without_unreached_limits
 from sysid_btr.terms.model import Model
@@ -35,6 +38,8 @@ def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress
         study, coarse = first_fit(recorded, coarse.model, budget.after(spent), progress)
         coarse = replace(coarse, evaluations=coarse.evaluations + spent)
     if float(coarse.train_columns.max()) > MISFIT:
+        coarse = _with_room(study, coarse, budget, progress)
+    if float(coarse.train_columns.max()) > MISFIT:
         if not study.procedure.weighs_segments:
             study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS, budget, progress)
         study = inflate(study, coarse, memory=True)
@@ -42,6 +47,18 @@ def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress
         # by errors of the size that the model leaves
         study = study.with_initial_states(coarse.model)
     return study, coarse
+
+
+def _with_room(study: Study, coarse: Fitted, budget: Budget, progress: Progress) -> Fitted:
+    """A first fit within bounds that are wide enough: what they keep it from explaining is no error of the model."""
+    model, spent = coarse.model, coarse.evaluations
+    if not on_bounds(model).any():
+        return coarse
+    problem, step = study.train_problem(model), study.stencil(model.terms)
+    residual, jacobian = linearise(problem, model.values, step=step)
+    spent += 2 * len(model.values) + 1
+    at, more = grow_bounds(study, Optimum(problem, model.values, jacobian, residual), budget.after(spent), progress)
+    return judge(study, at.problem.model.at(at.values), spent + more) if more else replace(coarse, evaluations=spent)
 
 
 def realise_servo(study: Study, model: Model) -> Study:

@@ -16,6 +16,7 @@ from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.estimators.base import Budget, Derived, FitResult, Progress, ResidualEstimator, Termination
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import linearise
+from sysid_btr.identify.prior import MapProblem
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.numerics import Numerics
 
@@ -41,7 +42,7 @@ class Corrected(Derived):
     point : (p,).
     """
 
-    problem: ReplayProblem
+    problem: ReplayProblem | MapProblem
     right: FloatArray
     offset: FloatArray
     point: FloatArray
@@ -72,7 +73,7 @@ class Corrected(Derived):
         return np.asarray(np.sum(self.residuals(candidates) ** 2, axis=1))
 
 
-def corrected(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> Corrected:
+def corrected(problem: ReplayProblem | MapProblem, cheap: Numerics, values: FloatArray) -> Corrected:
     """The problem under a cheap integrator, right at `values` (p,)."""
     rough = problem.with_numerics(cheap)
     pair = [p.residuals(values[None])[0] for p in (problem, rough)]
@@ -89,7 +90,7 @@ def cheaper(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> Repl
 
 
 def deferred_fit(
-    problem: ReplayProblem,
+    problem: ReplayProblem | MapProblem,
     cheap: Numerics,
     estimator: ResidualEstimator,
     *,

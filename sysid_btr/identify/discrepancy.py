@@ -23,6 +23,7 @@ from sysid_btr.identify.missing_torque import (
     smooth_sign,
     torque_responses,
 )
+from sysid_btr.identify.prior import Stated
 from sysid_btr.objectives.covariance import newton, spread
 from sysid_btr.objectives.problem import Comparison, ReplayProblem
 from sysid_btr.simulation.segments import SegmentReplay
@@ -197,9 +198,12 @@ def widened(
         return tuple(found)
     parameters, blocks = problem.parameters, problem.blocks
     white = doubt.whiten(np.column_stack([jacobian, residual]))
-    steep, rest = white[:, :-1], white[:, -1]
+    stated = Stated.of(parameters)
+    slopes, off = np.diag(stated.weight), (values - stated.nominal) * stated.weight
+    steep, rest = np.vstack([white[:, :-1], slopes]), np.concatenate([white[:, -1], off])
     shift = newton(steep, rest)
-    cov, _ = spread(steep, rest + steep @ shift, blocks)
+    apart = blocks.max() + 1 + np.arange(len(parameters))
+    cov, _ = spread(steep, rest + steep @ shift, np.concatenate([blocks, apart]))
     std, together = np.sqrt(np.diag(cov)), correlations(cov)
     result = []
     for i, (one, parameter) in enumerate(zip(found, parameters, strict=True)):

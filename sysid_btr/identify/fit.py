@@ -21,7 +21,7 @@ from sysid_btr.identify.deferred import cheaper, deferred_fit
 from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fixing import fix_unidentifiable
-from sysid_btr.identify.intervals import Estimate, Profile, estimates
+from sysid_btr.identify.intervals import Estimate, Profile, estimates, held_to_model
 from sysid_btr.identify.nuisance import assumptions, check_nuisance, error_of_the_rest
 from sysid_btr.identify.outcome import StudyOutcome
 from sysid_btr.identify.recorder import as_recorded
@@ -191,7 +191,7 @@ def fit(
     at = Optimum.of(solved.problem, solved.result, study.stencil(terms))
     if solved.by_residuals:
         with phase("bounds", 0.2):
-            at, spent = grow_bounds(study, at, rng, budget.after(replays), progress)
+            at, spent = grow_bounds(study, at, budget.after(replays), progress)
             model, replays = at.problem.model, replays + spent
         with phase("half the step", 0.3):
             study, at, shift, spent = with_short_steps(study, model, at, rng, budget.after(replays), progress)
@@ -212,11 +212,14 @@ def fit(
                 near = cheaper(problem, study.cheap, values)
                 found, spent = followed(problem.parameters, found, near, values, jacobian)
                 replays += spent
-            values, found, spent = fix_unidentifiable(problem, values, found, jacobian, known, budget.after(replays))
+            goal, left = study.with_belief(problem), budget.after(replays)
+            values, found, spent = fix_unidentifiable(goal, values, found, jacobian, known, left)
             replays += spent
     before = score(study, model.at(values))
     if misfit_of(before.train, study.leading_channel, study.procedure.tolerated) is not None:
         found = widened(found, problem, at.values, jacobian, residual, study.scales)
+    if solved.by_residuals and known is None and study.redundancy:
+        found = held_to_model(found, problem.parameters)
     return Fit(
         study=study,
         model=model.at(values),
@@ -285,9 +288,10 @@ class _Search:
             study, coarse = weigh_columns(study, model.at(problem.start), budget, without_loss(progress))
         budget = budget.after(coarse.evaluations)
         problem, spent = study.train_problem(coarse.model), spent + coarse.evaluations
+        believed = study.with_belief(problem)
         if study.procedure.deferred:
             result = deferred_fit(
-                problem,
+                believed,
                 study.cheap,
                 study.procedure.suited(estimator),
                 step=study.stencil(model.terms),
@@ -297,7 +301,7 @@ class _Search:
                 progress=progress,
             )
         else:
-            result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
+            result = estimator.fit(believed, rng=rng, budget=budget, journal=journal, progress=progress)
         return _Solved(study, problem, result, result.evaluations + spent, True)
 
 

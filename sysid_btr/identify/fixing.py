@@ -12,6 +12,7 @@ from sysid_btr.estimators.base import Budget, Termination, silent
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import NOT_IDENTIFIABLE, Estimate
+from sysid_btr.identify.prior import MapProblem
 from sysid_btr.objectives.covariance import RANK, Known
 from sysid_btr.objectives.problem import Conditional, ReplayProblem
 
@@ -22,7 +23,7 @@ WORSE = 1.01
 
 
 def fix_unidentifiable(
-    problem: ReplayProblem,
+    problem: ReplayProblem | MapProblem,
     values: FloatArray,
     found: tuple[Estimate, ...],
     jacobian: FloatArray,

@@ -6,7 +6,7 @@ The covariance is that of `objectives.covariance`, widened by what halving the s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -39,6 +39,8 @@ class Estimate:
     at_bound : whether the estimate lies on a bound.
     reason : why it is not identifiable, or what limits it; empty otherwise.
     std_if_right : standard error if the model were right, where `std` and `ci95` hold for what it lacks too; else None.
+    prior_std : standard deviation about the nominal value that it was taken to have whatever the log says, where the
+        model leaves more than noise; None where nothing was.
     correlation : of its error with that of each parameter estimated beside it, itself included, in their order; NaN
         where nothing is known. Empty where it was not worked out.
     change, moves : a change of it that matters, and by how many noise floors (root mean square) this moves each sensor
@@ -56,6 +58,7 @@ class Estimate:
     at_bound: bool
     reason: str
     std_if_right: float | None = None
+    prior_std: float | None = None
     correlation: tuple[float, ...] = field(default=(), compare=False)
     change: float = field(default=0.0, compare=False)
     moves: Mapping[str, float] = field(default_factory=dict, compare=False)
@@ -250,3 +253,9 @@ def identifiability(
         f"confounded on this log with {parameters[partner].name} (correlation {correlation[partner]:+.2f}); their "
         f"weighted {sign} is identifiable, their {'sum' if sign == 'difference' else 'difference'} is not"
     )
+
+
+def held_to_model(found: Sequence[Estimate], parameters: Sequence[Parameter]) -> tuple[Estimate, ...]:
+    """Estimates that say which of them were held to what the model states."""
+    stds = (p.spread if np.isfinite(p.spread) else None for p in parameters)
+    return tuple(replace(one, prior_std=std) for one, std in zip(found, stds, strict=True))

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.base import Budget, Progress, Termination, silent
+from sysid_btr.estimators.base import Budget, FitResult, Progress, Termination, silent
 from sysid_btr.estimators.evaluator import Evaluator, Stop
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.deferred import LEAST_GAIN, deferred_fit
+from sysid_btr.identify.prior import Stated
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.simulation.numerics import Numerics
@@ -22,6 +23,11 @@ CORRELATED = 1.5
 """Chi2 of a column beyond which its residual is an error of the model rather than noise."""
 NOTICEABLE = 0.99
 """Fraction of a loss that another start must reach."""
+RELIEVED = 0.5
+"""Ratio of a column's squared error to the one that it was weighed by, from which what a model states counts too much
+beside it."""
+RELIEFS = 4
+"""Times that columns are weighed anew at most."""
 CLEAN = 1.02
 """Chi2 of a column below which it counts as explained."""
 
@@ -100,14 +106,39 @@ def refit(
 ) -> Fitted:
     """Least squares that begin at a model; `polish` runs to convergence with central differences.
 
-    `judged` is the study whose data say how good the result is, where that is not the one that is fitted.
+    `judged` is the study whose data say how good the result is, where that is not the one that is fitted. What a model
+    states of its masses counts beside the errors that the study's columns are weighed by; where the model leaves much
+    less, it is refitted beside its own.
 
     Raises
     ------
     KeyboardInterrupt
         The user interrupted; the study's journal, if it has one, holds what was simulated, except to polish.
     """
-    problem = study.train_problem(model.clipped())
+    budget, spent = budget or Budget(), 0
+    for _ in range(RELIEFS):
+        result = _minimised(study, model, polish, iterations, budget.after(spent), progress)
+        model, spent = model.at(result.x), spent + result.evaluations
+        found = judge(judged or study, model, evaluations=spent)
+        if not Stated.of(model.terms.parameters, study.redundancy).weight.any():
+            break
+        own = inflate(study, found, memory=study.independent)
+        if not _is_relieved(study, own):
+            break
+        study = own
+    return found
+
+
+def _is_relieved(study: Study, own: Study) -> bool:
+    """Whether columns are weighed by errors far beyond those of a model of its own."""
+    return any(error**2 < RELIEVED * study.inflation.get(key, 1.0) ** 2 for key, error in own.inflation.items())
+
+
+def _minimised(
+    study: Study, model: Model, polish: bool, iterations: int, budget: Budget, progress: Progress
+) -> FitResult:
+    """Least squares as the study's columns are weighed."""
+    problem = study.with_belief(study.train_problem(model.clipped()))
     estimator = LeastSquares(
         confirm=polish,
         max_iterations=30 if polish else iterations,
@@ -118,7 +149,7 @@ def refit(
     estimator = study.procedure.suited(estimator)
     if structural:
         estimator = replace(estimator, forward_step=step, central_step=step)
-    rng, budget = np.random.default_rng(0), budget or Budget()
+    rng = np.random.default_rng(0)
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
     # play makes the objective rough; of laws that fit badly the corrections take more than they save
@@ -132,7 +163,7 @@ def refit(
         result = estimator.fit(problem, rng=rng, budget=budget, journal=journal, progress=progress)
     if result.termination is Termination.INTERRUPTED:
         raise KeyboardInterrupt
-    return judge(judged or study, model.at(result.x), evaluations=result.evaluations)
+    return result
 
 
 def nearby(study: Study, cheap: Numerics, model: Model) -> tuple[float, Model]:
@@ -152,7 +183,7 @@ def best_start(study: Study, terms: Terms, starts: FloatArray) -> FloatArray:
     starts = np.clip(starts, terms.lower, terms.upper)
     if len(starts) == 1:
         return np.asarray(starts[0])
-    problem = study.train_problem(Model(terms, starts[0]))
+    problem = study.with_belief(study.train_problem(Model(terms, starts[0])))
     try:
         losses = Evaluator(problem, budget=Budget(), journal=study.section(), progress=silent).loss(starts)
     except Stop:
@@ -206,13 +237,18 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     wrong for finding its cause.
     """
     problem = study.train_problem(fitted.model)
+    wrong = fitted.train_columns > CORRELATED
+    length = np.where(wrong, fitted.memory, 1.0)
+    redundancy = 0.0 if not wrong.any() else problem.count / float(np.sum(problem.counts / length))
     worst: dict[tuple[str, str, str], float] = {}
-    for chi2, length, (i, target, k) in zip(fitted.train_columns, fitted.memory, problem.columns, strict=True):
+    for chi2, own, (i, target, k) in zip(fitted.train_columns, length, problem.columns, strict=True):
         key = (problem.episodes[i].replay.log.meta.mount, target.channel, target.joints[k])
         # noise is white; an error of the model is not, and says as little as its independent samples
-        error = chi2 * length if memory and chi2 > CORRELATED else chi2
+        error = chi2 * own if memory else chi2
         worst[key] = max(worst.get(key, 1.0), float(np.sqrt(error)) if np.isfinite(error) else 1.0)
-    return replace(study, inflation=worst, independent=memory)
+    return replace(
+        study, inflation=worst, independent=memory, redundancy=min(redundancy, 1.0) if memory else redundancy
+    )
 
 
 def robust_refit(

@@ -44,10 +44,14 @@ class Optimum:
 
     @classmethod
     def of(cls, problem: ReplayProblem, result: FitResult, step: float) -> Optimum:
-        """Linearised with a finite-difference step, fraction of the range, where the estimator has not done so."""
-        if result.jacobian is not None and result.residual is not None:
-            return cls(problem, result.x, result.jacobian, result.residual)
-        residual, jacobian = linearise(problem, result.x, step=step)
+        """Linearised with a finite-difference step, fraction of the range, where the estimator has not done so.
+
+        Data alone, whatever else the estimator was told.
+        """
+        if result.jacobian is None or result.residual is None:
+            residual, jacobian = linearise(problem, result.x, step=step)
+        else:
+            residual, jacobian = result.residual[: problem.count], result.jacobian[: problem.count]
         return cls(problem, result.x, jacobian, residual)
 
     @property
@@ -77,7 +81,8 @@ def with_short_steps(
         study = replace(study, numerics=study.numerics.halved())
         problem = study.train_problem(model.at(at.values))
         left = budget.after(spent)
-        polished = LeastSquares().fit(problem, rng=rng, budget=left, journal=Journal(), progress=progress)
+        goal = study.with_belief(problem)
+        polished = LeastSquares().fit(goal, rng=rng, budget=left, journal=Journal(), progress=progress)
         spent += polished.evaluations
         at = Optimum.of(problem, polished, study.stencil(model.terms))
     return study, at, shift, spent

@@ -15,6 +15,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.executors.base import HERE, Executor
 from sysid_btr.identify.episode import Episode, Fused, Inflation, Procedure
 from sysid_btr.identify.mode import AUTOMATIC, Mode, episode_of, split_episode
+from sysid_btr.identify.prior import MapProblem, Stated
 from sysid_btr.identify.segmented import measured_motion
 from sysid_btr.io.log import Log
 from sysid_btr.io.split import split_episodes
@@ -56,6 +57,8 @@ class Study:
         wrong about the ground is not an error of a robot that hangs.
     numerics_error : largest change of a predicted sensor when the step is halved, in noise floors.
     independent : whether `inflation` lets each column count as its independent samples do.
+    redundancy : residuals that say as much as one that is independent of the others, where the model leaves more than
+        noise; 0 where it leaves noise alone, beside which what robots have from their models says nothing.
     nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, for the intervals.
     executor : where candidates are simulated.
     journal : record of refits, from which an interrupted search goes on; None keeps none.
@@ -73,6 +76,7 @@ class Study:
     journal: Journal | None = None
     nuisance: Mapping[str, float] = field(default_factory=dict)
     independent: bool = False
+    redundancy: float = 0.0
 
     def __repr__(self) -> str:
         parts = f"{len(self.train)} episodes fitted, {len(self.holdout)} held out"
@@ -109,6 +113,11 @@ class Study:
     def train_problem(self, model: Model | Iterable[Term]) -> ReplayProblem:
         """What is fitted, by a search that begins at a model; bare terms begin at their nominal values."""
         return self._problem(self.train, as_model(model))
+
+    def with_belief(self, problem: ReplayProblem) -> ReplayProblem | MapProblem:
+        """What is minimised: beside a model's error, that a robot is about what its model states."""
+        belief = Stated.of(problem.parameters, self.redundancy)
+        return MapProblem(problem, belief, problem.deviation) if belief.weight.any() else problem
 
     def holdout_problem(self, model: Model | Iterable[Term]) -> ReplayProblem:
         """What is predicted without having been fitted."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -341,6 +341,28 @@ def _begins(a: Replay, b: Replay) -> bool:
     )
 
 
+class Grouped(Protocol):
+    """A problem by residuals, parameters of which can be varied in one simulation; see `ReplayProblem`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def lower(self) -> FloatArray: ...
+
+    @property
+    def upper(self) -> FloatArray: ...
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]: ...
+
+    def support(self, parameter: int) -> BoolArray | None: ...
+
+    def residuals(self, candidates: FloatArray) -> FloatArray: ...
+
+    def loss(self, candidates: FloatArray) -> FloatArray: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Conditional:
     """A problem in some of its parameters, the others held.
@@ -352,7 +374,7 @@ class Conditional:
     values : (p,) the held values, and where the free ones start.
     """
 
-    whole: ReplayProblem
+    whole: Grouped
     free: BoolArray
     values: FloatArray
 

@@ -38,6 +38,8 @@ class Parameter:
     lower, upper : bounds of the search.
     scale : size of a change that matters (finite differences, starts, scans).
     stated : whether the bounds are the user's or the robot's, which do not grow.
+    spread : standard deviation of what robots have from the nominal value; infinite where a model states nothing, or
+        the user states bounds.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Parameter:
     upper: float
     scale: float
     stated: bool = False
+    spread: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,12 @@ class Kind:
     lower: float
     upper: float
     scale: float
+    spread: float = np.inf
 
 
 def parameter_of(kind: Kind, name: str) -> Parameter:
     """A parameter of a kind, by name."""
-    return Parameter(name, kind.unit, kind.nominal, kind.lower, kind.upper, kind.scale)
+    return Parameter(name, kind.unit, kind.nominal, kind.lower, kind.upper, kind.scale, spread=kind.spread)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol, TypeVar
@@ -183,7 +184,8 @@ def make_term(bare: Term, places: tuple[str, ...], robot: Robot, scales: Scales 
         named = f"{parameter.name.partition(':')[0]}:{label}"
         kind = term.in_units_of(kind, slide=_slides(model, places[0]))
         own = parameter_of(replace(kind, lower=bounds[0], upper=bounds[1]), named)
-        known.append(replace(own, stated=stated is not None))
+        # who states bounds knows better than the model
+        known.append(replace(own, stated=True, spread=math.inf) if stated else own)
     term = replace(term, known=tuple(known))
     return term if scales is None else term.over(scales)
 
