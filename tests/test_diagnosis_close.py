@@ -39,11 +39,11 @@ from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, StribeckFriction, ViscousDamping
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
-from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
+from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderCyclicError, EncoderOffset, SensorDelay
 from sysid_btr.terms.servo import CommandDelay, IntegralGain, Kp
-from sysid_btr.terms.spring import JointSpring
+from sysid_btr.terms.spring import JointSpring, JointStop
 from sysid_btr.terms.transmission import Backlash, Cogging, JointCompliance
 from sysid_btr.writeback.write import identified
 
@@ -309,7 +309,9 @@ PLANTS = [
     Plant(Backlash(KNEE), (0.03, 0.001)),
     Plant(JointCompliance(KNEE), (0.03,), rivals=("backlash",)),
     Plant(JointSpring(KNEE), (1.0, 0.3), rivals=("encoder_scale",)),
+    Plant(JointStop(KNEE), (3.0, 0.1)),
     Plant(TorqueLimit(KNEE), (1.0,), rivals=("speed_torque_limit",)),
+    Plant(TorqueLimitSoft(KNEE), (1.5,)),
     Plant(SpeedTorqueLimit(KNEE), (2.0, 6.0), rivals=("torque_limit",)),
     Plant(SlewLimit(KNEE), (2.5,)),
     Plant(IntegralGain(KNEE), (20.0,)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from sysid_btr.report.curves import plot_curves
 from sysid_btr.report.figures import figure_of
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.free_form import (
     EVEN,
@@ -27,6 +28,7 @@ from sysid_btr.terms.free_form import (
     FreeFrictionSpeed,
     FreeGainTime,
     FreeReadingPosition,
+    FreeReadingTime,
     FreeTorqueLoad,
     FreeTorquePeriodic,
     FreeTorquePosition,
@@ -115,6 +117,13 @@ def test_a_straight_error_of_the_encoder_is_one_of_its_scale() -> None:
     assert term.axes == ("position (rad)", "error (rad)")
 
 
+def test_an_error_of_the_encoder_over_time_is_in_what_the_log_shows_alone() -> None:
+    term = at_knee(FreeReadingTime)
+    drift = 0.03 * np.minimum(LOG.time, term.ranges[0][1])
+    amounts = fitted(term, LOG.time, drift)
+    np.testing.assert_allclose(moved(term, amounts) - moved(term, term.neutral), drift, atol=1e-4)
+
+
 def test_level_friction_that_does_not_depend_on_speed_is_dry_friction() -> None:
     dry = moved(CoulombFriction.at(("knee",), STUDY.scales), [0.2])
     np.testing.assert_allclose(moved(at_knee(FreeFrictionSpeed), [0.2, *[0.0] * 7]), dry, atol=1e-5)
@@ -200,13 +209,16 @@ def test_words_say_where_a_curve_goes(y: Callable[[np.ndarray], np.ndarray], wor
     assert curve_in_words(x, y(x), "rad", "Nm") == words
 
 
+def uncertain(p: Parameter, std: float) -> Estimate:
+    """A number of a curve, zero give or take its standard error."""
+    bounds = (p.lower, p.upper)
+    return Estimate(p.name, p.unit, 0.0, 0.0, std, (0.0, 0.0), bounds, "yes", at_bound=False, reason="")
+
+
 def test_a_report_draws_the_curve_with_its_interval_at_every_point() -> None:
     term = at_knee(FreeTorqueTime)
     values = np.array([0.2, 0.1, *[0.0] * 6])
-    known = [
-        Estimate(p.name, p.unit, 0.0, v, 0.01, (0.0, 0.0), (p.lower, p.upper), "yes", at_bound=False, reason="")
-        for p, v in zip(term.parameters, values, strict=True)
-    ]
+    known = [replace(uncertain(p, 0.01), value=v) for p, v in zip(term.parameters, values, strict=True)]
     (curve,) = curves_of(Model.of([term], values), known)
     np.testing.assert_allclose(curve.value, term.curve("knee", values, curve.x))
     size = 1.96 * 0.01 * np.sqrt(np.sum(term.modes_of("knee", curve.x) ** 2, axis=1))
@@ -222,9 +234,7 @@ def test_numbers_that_err_together_make_a_curve_as_uncertain_as_their_sum() -> N
     rows = np.eye(8)
     rows[0, 1] = rows[1, 0] = -1.0
     known = [
-        Estimate(
-            p.name, p.unit, 0.0, 0.0, 0.01 * (i < 2), (0.0, 0.0), (p.lower, p.upper), "yes", False, "", None, tuple(row)
-        )
+        replace(uncertain(p, 0.01 * (i < 2)), correlation=tuple(row))
         for i, (p, row) in enumerate(zip(term.parameters, rows, strict=True))
     ]
     (curve,) = curves_of(Model.of([term], np.zeros(8)), known)

@@ -49,7 +49,7 @@ from sysid_btr.terms.friction import (
 )
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
-from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
+from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
 from sysid_btr.terms.sensing import (
     EncoderCyclicError,
@@ -62,7 +62,7 @@ from sysid_btr.terms.sensing import (
     TorqueScale,
 )
 from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain
-from sysid_btr.terms.spring import JointSpring
+from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow, Tether
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
 SCALES = {"arm": SCALE}
@@ -198,6 +198,27 @@ def test_springs_add_up_with_the_models_own() -> None:
     q = solve(lambda q: KP * (COMMAND - q) - gravity(q) - 1.5 * q - 2.0 * (q - 0.2))
     seen = position(sprung, held(COMMAND, 4.0), [at_arm(JointSpring)], [2.0, 0.2])[-1, 0]
     assert seen == pytest.approx(q, abs=1e-9)
+
+
+@pytest.mark.parametrize(("stop", "way"), [(JointStop, 1.0), (JointStopBelow, -1.0)])
+def test_a_soft_stop_pushes_back_beyond_its_onset_and_nowhere_else(stop: type[Effect], way: float) -> None:
+    q = solve(lambda q: KP * (way * COMMAND - q) - gravity(q) - 2.0 * (q - way * 0.2))
+    assert rest(stop, [2.0, way * 0.2], command=way * COMMAND) == pytest.approx(q, abs=1e-9)
+    free = rest(JointSpring, [0.0, 0.0], command=-way * COMMAND)
+    assert rest(stop, [2.0, way * 0.2], command=-way * COMMAND) == pytest.approx(free, abs=1e-9)
+
+
+@pytest.mark.parametrize("length", [0.0, 0.3, 5.0])
+def test_a_tether_pulls_towards_its_point_where_it_is_taut(length: float) -> None:
+    stiffness, anchor = 3.0, np.array([0.6, 0.1, -0.4])
+
+    def torque(q: float) -> float:
+        at, lever = LENGTH * np.array([-np.sin(q), 0.0, -np.cos(q)]), LENGTH * np.array([-np.cos(q), 0.0, np.sin(q)])
+        far = np.linalg.norm(anchor - at)
+        return float(stiffness * max(far - length, 0.0) / far * (anchor - at) @ lever)
+
+    q = solve(lambda q: KP * (COMMAND - q) - gravity(q) + torque(q))
+    assert rest(Tether, [stiffness, *anchor, length]) == pytest.approx(q, abs=1e-7)
 
 
 def test_cogging_is_a_sine_and_a_cosine_of_the_angle() -> None:
@@ -426,6 +447,16 @@ def test_a_torque_limit_never_widens_the_models_own() -> None:
     limited = robot_from_xml(PENDULUM.replace(f'kv="{KV}"', f'kv="{KV}" forcerange="-.3 .3"'))
     log = held(2.0)
     np.testing.assert_array_equal(position(limited, log, [at_arm(TorqueLimit)], [0.4]), position(limited, log))
+
+
+def test_a_soft_torque_limit_takes_some_of_every_torque_and_is_never_passed() -> None:
+    limit = 0.8
+    q = rest(TorqueLimitSoft, [limit])
+    given = gravity(q)
+    assert given == pytest.approx(KP * (COMMAND - q) / np.hypot(1, KP * (COMMAND - q) / limit), abs=1e-6)
+    outputs = run(pendulum(), held(50.0, 0.3), [at_arm(TorqueLimitSoft)], [limit], Numerics("RK4", 0.001), effort=True)
+    assert outputs.effort is not None
+    np.testing.assert_allclose(outputs.effort[0, :, 0], limit, rtol=1e-3)
 
 
 def test_torque_falls_with_speed_and_is_gone_at_the_no_load_speed() -> None:

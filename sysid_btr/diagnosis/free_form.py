@@ -27,7 +27,9 @@ from sysid_btr.terms.free_form import (
     FreeFrictionPosition,
     FreeFrictionSpeed,
     FreeGainTime,
+    FreeReading,
     FreeReadingPosition,
+    FreeReadingTime,
     FreeTorqueCommand,
     FreeTorqueLoad,
     FreeTorquePeriodic,
@@ -68,6 +70,7 @@ VARIABLES: Mapping[type[FreeCurve], Callable[[MissingTorque], FloatArray]] = {
     FreeTorqueLoad: lambda m: m.servo,
     FreeTorqueCommand: lambda m: m.command,
     FreeTorqueTime: lambda m: m.time,
+    FreeReadingTime: lambda m: m.time,
     FreeTorquePeriodic: lambda m: m.time,
     FreeGainTime: lambda m: m.time,
 }
@@ -78,7 +81,7 @@ PER_UNIT: Mapping[type[FreeCurve], Callable[[MissingTorque], FloatArray]] = {
     FreeGainTime: lambda m: m.servo_measured,
 }
 """Torque for a curve of 1, of those that are no torques themselves."""
-OF_TIME = (FreeTorqueTime, FreeTorquePeriodic, FreeGainTime)
+OF_TIME = (FreeTorqueTime, FreeReadingTime, FreeTorquePeriodic, FreeGainTime)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +154,7 @@ class _Evidence:
 
 
 def _evidence(effect: type[FreeCurve], one: MissingTorque, problem: ReplayProblem) -> _Evidence:
-    if not issubclass(effect, FreeReadingPosition):
+    if not issubclass(effect, FreeReading):
         return _Evidence(one, one.torque, one.noise)
     targets = (t for t in problem.episodes[one.episode].targets if one.joint in t.joints)
     noise = next((float(t.noise[t.joints.index(one.joint)]) for t in targets if t.channel == "position"), 0.0)
@@ -180,7 +183,7 @@ def _form(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale, 
     for each in own:
         rows = slice(None, None, -(-len(each.values) // MOST))
         columns = design(effect, each.one, ends, *more)
-        seen.append((columns if issubclass(effect, FreeReadingPosition) else each.one.seen(columns))[rows])
+        seen.append((columns if issubclass(effect, FreeReading) else each.one.seen(columns))[rows])
         torque.append(each.values[rows])
     block = SHORT_STRETCH if effect in OF_TIME else STRETCH
     curve = _penalised(np.concatenate(torque), np.concatenate(seen), relative)

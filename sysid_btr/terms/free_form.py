@@ -648,31 +648,38 @@ class FreeFrictionPosition(FreeFriction):
 
 
 @dataclass(frozen=True)
-class FreeReadingPosition(FreeCurve):
-    """An error of the logged position that is a smooth function of the position: an eccentric disc, a worn track.
-
-    Sensor: the log shows q and the curve at q; the servo uses the true q.
-    """
+class FreeReading(FreeCurve):
+    """Base: an error of the logged position; the servo uses the true one."""
 
     name: ClassVar[str] = "free_reading"
     family: ClassVar[str] = "sensor"
-    variant: ClassVar[str] = "position"
-    label: ClassVar[str] = "free_reading.position"
-    title: ClassVar[str] = "error of the encoder that depends on the position"
-    variable: ClassVar[str] = "position"
-    variable_unit: ClassVar[str] = "rad"
     amount: ClassVar[str] = "error"
     article: ClassVar[str] = "an "
     kinds: ClassVar[tuple[Kind, ...]] = _kinds(modal_bounds(SPLINES), 0.3, 0.005, "rad")
-    includes: ClassVar[tuple[str, ...]] = ("encoder_offset", "encoder_scale")
-    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("free_torque", "a logged effort, or motion whose stiffness to torque changes"),
-    )
+    includes: ClassVar[tuple[str, ...]] = ("encoder_offset",)
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         reach = 0.3 * scale.span if scale.slide else 0.3
         return _kinds(modal_bounds(SPLINES), reach, reach / 60, "rad")
+
+
+@dataclass(frozen=True)
+class FreeReadingPosition(FreeReading):
+    """An error of the logged position that is a smooth function of the position: an eccentric disc, a worn track.
+
+    Sensor: the log shows q and the curve at q.
+    """
+
+    variant: ClassVar[str] = "position"
+    label: ClassVar[str] = "free_reading.position"
+    title: ClassVar[str] = "error of the encoder that depends on the position"
+    variable: ClassVar[str] = "position"
+    variable_unit: ClassVar[str] = "rad"
+    includes: ClassVar[tuple[str, ...]] = ("encoder_offset", "encoder_scale")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("free_torque", "a logged effort, or motion whose stiffness to torque changes"),
+    )
 
     @classmethod
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
@@ -684,6 +691,34 @@ class FreeReadingPosition(FreeCurve):
         outputs.position[:, :, columns] += modal_sum(values[:, None], modes)
 
 
+@dataclass(frozen=True)
+class FreeReadingTime(FreeReading):
+    """An error of the logged position that changes slowly with time: a drift with warmth, a disc that slips.
+
+    Sensor: the log shows q and the curve at its time.
+    """
+
+    variant: ClassVar[str] = "time"
+    label: ClassVar[str] = "free_reading.time"
+    title: ClassVar[str] = "error of the encoder that changes slowly with time"
+    variable: ClassVar[str] = "time"
+    variable_unit: ClassVar[str] = "s"
+    transient: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("free_torque.time", "a logged effort, or motion whose stiffness to torque changes"),
+    )
+
+    @classmethod
+    def range_of(cls, scale: JointScale) -> tuple[float, float]:
+        return 0.0, scale.seconds
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        low, high = self._bounds
+        for place, column in enumerate(batch.index.of(self.places)):
+            modes = self.modes_at(outputs.time, low[place], high[place])
+            outputs.position[:, :, column] += modal_sum(values[:, None, place], modes)
+
+
 FREE_FORMS: tuple[type[FreeCurve], ...] = (
     FreeFrictionSpeed,
     FreeFrictionLoad,
@@ -693,6 +728,7 @@ FREE_FORMS: tuple[type[FreeCurve], ...] = (
     FreeTorqueVelocity,
     FreeTorquePeriodic,
     FreeTorqueTime,
+    FreeReadingTime,
     FreeGainTime,
     FreeTorqueCommand,
     FreeTorqueLoad,

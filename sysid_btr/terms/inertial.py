@@ -31,9 +31,9 @@ def allow_any_inertia(spec: mujoco.MjSpec, places: tuple[str, ...]) -> None:
 class Mass(Effect):
     """Mass of a body as a factor of the nominal; the inertia follows.
 
-    Native: `body_mass` and `body_inertia`. Robots have it from their models' by a fifth: between those who weighed the parts
-    (0.8 to 1.2: Tan et al. 2018, doi:10.15607/RSS.2018.XIV.010) and those who did not (0.5 to 1.5: Andrychowicz et al. 2020,
-    doi:10.1177/0278364919887447).
+    Native: `body_mass` and `body_inertia`. Robots have it from their models' by a fifth: between those who weighed the
+    parts (0.8 to 1.2: Tan et al. 2018, doi:10.15607/RSS.2018.XIV.010) and those who did not (0.5 to 1.5: Andrychowicz
+    et al. 2020, doi:10.1177/0278364919887447).
     """
 
     name: ClassVar[str] = "mass"

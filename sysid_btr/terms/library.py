@@ -30,7 +30,7 @@ from sysid_btr.terms.friction import (
 )
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Inertia, Mass, Payload
 from sysid_btr.terms.initial_state import StartPosition, StartVelocity
-from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit
+from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
 from sysid_btr.terms.sensing import (
     EncoderCyclicError,
@@ -43,7 +43,7 @@ from sysid_btr.terms.sensing import (
     TorqueScale,
 )
 from sysid_btr.terms.servo import ActuatorFilter, BackEmf, CommandDelay, IntegralGain, Kp, Kv, TorqueConstant
-from sysid_btr.terms.spring import JointSpring
+from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow, Tether
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
 ENTRY_POINTS = "sysid_btr.terms"
@@ -75,6 +75,9 @@ BUILT_IN: tuple[type[Term], ...] = (
     JointCompliance,
     JointComplianceMotor,
     JointSpring,
+    JointStop,
+    JointStopBelow,
+    Tether,
     EncoderOffset,
     EncoderOffsetInLoop,
     EncoderScale,
@@ -82,6 +85,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     TorqueOffset,
     TorqueScale,
     TorqueLimit,
+    TorqueLimitSoft,
     SpeedTorqueLimit,
     SlewLimit,
     IntegralGain,

@@ -69,6 +69,40 @@ class TorqueLimit(Effect):
 
 
 @dataclass(frozen=True)
+class TorqueLimitSoft(TorqueLimit):
+    """A drive that gives the less of what it is asked for, the nearer that comes to a limit: iron that saturates.
+
+    Law: torque = asked / sqrt(1 + (asked / limit)^2); none at its neutral value.
+    """
+
+    variant: ClassVar[str] = "soft"
+    field: ClassVar[str] = ""
+    title: ClassVar[str] = "limit of the torque, which falls short long before"
+    law_acts: ClassVar[tuple[str, ...]] = ("servo",)
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        peak = max(scale.torque_peak, 1e-9)
+        return (Kind("limit", "Nm", 10 * peak, 0.1 * peak, 10 * peak, 0.05 * peak),)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return tuple(((f * max(scale.torque_peak, 1e-9),),) for f in (2.0, 1.0, 0.5, 0.25))
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        return {}
+
+    def law_numbers(self, values: FloatArray) -> FloatArray:
+        return np.where(values >= self.neutral_of(0)[:, None], np.inf, values)
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            share = step.gain[j] * step.torque[j] / numbers[p, 0]
+            step.gain[j] /= np.sqrt(1 + share * share)
+
+
+@dataclass(frozen=True)
 class SpeedTorqueLimit(Effect):
     """A motor whose largest torque falls with speed: stall torque at rest, none at the no-load speed.
 
