@@ -374,6 +374,17 @@ def test_a_wave_that_no_law_has_is_learnt_as_one() -> None:
     assert over_floor(found) <= 1.1
 
 
+def test_an_encoder_that_drifts_is_told_from_what_acts_on_the_joint() -> None:
+    log = recorded(None)
+    drift = 0.04 * (1 - np.exp(-log.time / 3.0))
+    shown = {**log.channels, "position.knee": log.channels["position.knee"] + drift}
+    found = close(make_study(toys.leg(), [replace(log, channels=shown)]), TOY_FIT)
+    effect = only_effect(found)
+    assert (effect.family, effect.where, found.verdict) == ("sensor", KNEE, "explained"), found.message
+    assert "changes slowly with time" in effect.sentence
+    assert over_floor(found) <= 1.25
+
+
 def test_what_was_chosen_before_the_rest_was_known_is_compared_again() -> None:
     """A wrong gain of all servos first looks like damping; with friction found beside it, the log tells them apart."""
     friction = Plant(CoulombFriction(KNEE), (0.15,))

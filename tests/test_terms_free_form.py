@@ -26,6 +26,7 @@ from sysid_btr.terms.free_form import (
     FREE_FORMS,
     FreeCurve,
     FreeFrictionSpeed,
+    FreeGainOfAll,
     FreeGainTime,
     FreeReadingPosition,
     FreeReadingTime,
@@ -62,7 +63,7 @@ def moved(term: Term, values: object) -> np.ndarray:
 
 def fitted(term: FreeCurve, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Amounts whose curve is nearest to y(x)."""
-    return np.asarray(np.linalg.lstsq(term.modes_of("knee", x), y, rcond=None)[0])
+    return np.asarray(np.linalg.lstsq(term.modes_of(term.places[0], x), y, rcond=None)[0])
 
 
 def at_knee(cls: type[FreeCurve]) -> FreeCurve:
@@ -129,8 +130,9 @@ def test_level_friction_that_does_not_depend_on_speed_is_dry_friction() -> None:
     np.testing.assert_allclose(moved(at_knee(FreeFrictionSpeed), [0.2, *[0.0] * 7]), dry, atol=1e-5)
 
 
-def test_a_gain_that_falls_evenly_is_a_supply_that_sags() -> None:
-    term, rate = at_knee(FreeGainTime), 0.05
+@pytest.mark.parametrize(("cls", "place"), [(FreeGainTime, "knee"), (FreeGainOfAll, "robot")])
+def test_a_gain_that_falls_evenly_is_a_supply_that_sags(cls: type[FreeCurve], place: str) -> None:
+    term, rate = cls.at((place,), STUDY.scales), 0.05
     x = np.linspace(*term.ranges[0], 50)
     middle = 1.0 - rate * float(np.mean(term.ranges[0]))
     weaker = robot_from_xml(XML.replace('kp="20" kv=".5"', f'kp="{20 * middle}" kv="{0.5 * middle}"'))

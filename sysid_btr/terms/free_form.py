@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Outputs, Parameter
+from sysid_btr.terms.base import BatchModel, Kind, Outputs, Parameter, Scope
 from sysid_btr.terms.effect import COMMANDS, Effect, Probe
 from sysid_btr.terms.law import Step, drive, used_in_laws
 from sysid_btr.terms.scales import SLIDE_UNITS, JointScale, Scales, scale_at
@@ -496,7 +496,7 @@ class FreeGainTime(FreeCurve):
 
     name: ClassVar[str] = "free_gain"
     family: ClassVar[str] = "supply"
-    scope: ClassVar = "drive"
+    scope: ClassVar[Scope] = "drive"
     needs: ClassVar[str] = COMMANDS
     variant: ClassVar[str] = "time"
     label: ClassVar[str] = "free_gain.time"
@@ -528,6 +528,29 @@ class FreeGainTime(FreeCurve):
         for p, j in enumerate(places):
             own = numbers[p]
             step.gain[j] *= max(1.0 + spline(own[2:], in_range(step.time, own[0], own[1])), 0.0)
+
+
+@dataclass(frozen=True)
+class FreeGainOfAll(FreeGainTime):
+    """A change of the gain of all drives together that is a smooth function of time: the supply that they share.
+
+    Law: gain = 1 + the curve at each step, and never below 0.
+    """
+
+    usual: ClassVar[bool] = True
+    scope: ClassVar[Scope] = "robot"
+    variant: ClassVar[str] = "all"
+    label: ClassVar[str] = "free_gain.all"
+    title: ClassVar[str] = "change of all gains that follows time"
+    includes: ClassVar[tuple[str, ...]] = ("voltage_sag",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("thermal_derating", "the same at every joint"),)
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        own = numbers[0]
+        gain = max(1.0 + spline(own[2:], in_range(step.time, own[0], own[1])), 0.0)
+        for j in places:
+            step.gain[j] *= gain
 
 
 def _near_frequency(

@@ -17,7 +17,7 @@ from sysid_btr.terms.disturbance import (
     ExternalDisturbanceTrain,
 )
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.free_form import FREE_FORMS
+from sysid_btr.terms.free_form import FREE_FORMS, FreeGainOfAll
 from sysid_btr.terms.friction import (
     CoulombFriction,
     LoadFriction,
@@ -91,6 +91,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     IntegralGain,
     VoltageSag,
     VoltageSagLoad,
+    FreeGainOfAll,
     ThermalDerating,
     Payload,
     ComOffset,
