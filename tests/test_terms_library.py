@@ -14,6 +14,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Kind, Term
+from sysid_btr.terms.disturbance import ConstantForce
+from sysid_btr.terms.free_form import FreeTorquePosition
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.library import all_terms, effect_names, select_effects
@@ -51,6 +53,12 @@ def test_conformance(cls: type[Term], check: Callable[[type[Term], TermBench], N
 def test_every_promised_effect_is_there() -> None:
     assert set(NAMES.split()) <= set(effect_names())
     assert len({(t.name, t.variant) for t in all_terms()}) == len(all_terms())
+
+
+def test_a_torque_at_a_slide_is_called_a_force(bench: TermBench) -> None:
+    called = {place: ConstantForce.at((place,), bench.study.scales).described for place in ("hip", "slide")}
+    assert called == {"hip": "constant torque", "slide": "constant force"}
+    assert FreeTorquePosition.at(("slide",), bench.study.scales).axes == ("position (m)", "force (N)")
 
 
 def test_effects_are_chosen_by_name_and_a_wrong_name_is_told() -> None:

@@ -25,7 +25,7 @@ def sentence_of(effect: Effect, found: Sequence[Estimate]) -> str:
         )
         where = "" if effect.scope == "robot" else f" at {_places(group.split(','))}"
         parts.append(f"{where}: {amounts}")
-    text = effect.title + ";".join(parts)
+    text = effect.described + ";".join(parts)
     return f"{text} (95 %)" if "+-" in text else text
 
 

@@ -79,7 +79,7 @@ def curves_of(model: Model, estimates: Sequence[Estimate]) -> tuple[Curve, ...]:
                 Curve(
                     effect=term.label or term.name,
                     where=place,
-                    title=f"{place}: {term.title}",
+                    title=f"{place}: {term.described}",
                     words=term.in_words(place, values),
                     variable=variable,
                     amount=amount,

@@ -70,6 +70,16 @@ class Effect(Term):
     includes: ClassVar[tuple[str, ...]] = ()
     yields_to: ClassVar[tuple[str, ...]] = ()
 
+    @property
+    def described(self) -> str:
+        """Its title; what is a torque at a hinge is a force at a slide."""
+        return self.title.replace("torque", "force") if self.slides else self.title
+
+    @property
+    def slides(self) -> bool:
+        """Whether its places are slides, whose units are others."""
+        return bool(self.parameters) and self.parameters[0].unit != self.numbers[0].unit
+
     @classmethod
     def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
         """Values (kinds,) of an effect whose response is that of the probe's directions times `amounts`.

@@ -231,7 +231,8 @@ class FreeCurve(Effect):
         """What is across and upwards in a drawing of the curve, with units."""
         unit, across = self._units
         variable = self.variable if across == "1" else f"{self.variable} ({across})"
-        return variable, self.amount if unit == "1" else f"{self.amount} ({unit})"
+        amount = self.amount.replace("torque", "force") if self.slides else self.amount
+        return variable, amount if unit == "1" else f"{amount} ({unit})"
 
     @property
     def _units(self) -> tuple[str, str]:

@@ -77,7 +77,7 @@ class TorqueLimitSoft(TorqueLimit):
 
     variant: ClassVar[str] = "soft"
     field: ClassVar[str] = ""
-    title: ClassVar[str] = "limit of the torque, which falls short long before"
+    title: ClassVar[str] = "soft limit of the torque"
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
 
     @classmethod
