@@ -170,6 +170,7 @@ class Tether(Effect):
     )
     held: ClassVar[tuple[str, ...]] = ("length",)
     details: ClassVar[tuple[str, ...]] = held
+    includes: ClassVar[tuple[str, ...]] = ("constant_force",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("payload", "motion that turns the body and does not move it"),
         ("joint_spring", "motion of the joints before it"),
