@@ -28,7 +28,7 @@ SCALES: Scales = dict.fromkeys(LEG_JOINTS, SCALE)
 
 NAMES = """
     coulomb_friction viscous_damping quadratic_damping stribeck_friction load_friction armature
-    command_delay sensor_delay backlash joint_compliance joint_spring joint_stop tether encoder_offset
+    command_delay sensor_delay backlash joint_compliance joint_spring joint_stop encoder_offset
     encoder_scale encoder_cyclic_error
     torque_limit speed_torque_limit slew_limit integral_gain voltage_sag thermal_derating payload
     com_offset constant_force cogging external_disturbance gravity_tilt foot_friction foot_compliance

@@ -62,7 +62,7 @@ from sysid_btr.terms.sensing import (
     TorqueScale,
 )
 from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain
-from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow, Tether
+from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
 SCALES = {"arm": SCALE}
@@ -206,19 +206,6 @@ def test_a_soft_stop_pushes_back_beyond_its_onset_and_nowhere_else(stop: type[Ef
     assert rest(stop, [2.0, way * 0.2], command=way * COMMAND) == pytest.approx(q, abs=1e-9)
     free = rest(JointSpring, [0.0, 0.0], command=-way * COMMAND)
     assert rest(stop, [2.0, way * 0.2], command=-way * COMMAND) == pytest.approx(free, abs=1e-9)
-
-
-@pytest.mark.parametrize("length", [0.0, 0.3, 5.0])
-def test_a_tether_pulls_towards_its_point_where_it_is_taut(length: float) -> None:
-    stiffness, anchor = 3.0, np.array([0.6, 0.1, -0.4])
-
-    def torque(q: float) -> float:
-        at, lever = LENGTH * np.array([-np.sin(q), 0.0, -np.cos(q)]), LENGTH * np.array([-np.cos(q), 0.0, np.sin(q)])
-        far = np.linalg.norm(anchor - at)
-        return float(stiffness * max(far - length, 0.0) / far * (anchor - at) @ lever)
-
-    q = solve(lambda q: KP * (COMMAND - q) - gravity(q) + torque(q))
-    assert rest(Tether, [stiffness, *anchor, length]) == pytest.approx(q, abs=1e-7)
 
 
 def test_cogging_is_a_sine_and_a_cosine_of_the_angle() -> None:

@@ -60,7 +60,7 @@ from sysid_btr.progress import mention, phase
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
 from sysid_btr.simulation.segments import BASE, BaseStates, Segments
 from sysid_btr.terms.base import Outputs, Term
-from sysid_btr.terms.effect import FIXED_BASE, GROUND
+from sysid_btr.terms.effect import GROUND
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms
 
@@ -280,7 +280,7 @@ class InnovationsProcedure(Procedure):
 
     def shows(self, term: type[Term]) -> bool:
         """Neither the ground nor what needs a past shows in a step of one sample."""
-        return getattr(term, "needs", "") not in (GROUND, FIXED_BASE) and not remembers(term)
+        return getattr(term, "needs", "") != GROUND and not remembers(term)
 
 
 @dataclass(frozen=True, eq=False)

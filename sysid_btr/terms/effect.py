@@ -22,8 +22,6 @@ THRESHOLDS = (0.6, 0.72, 0.85, 1.0, 1.15, 1.3, 1.5)
 
 GROUND = "a free base on the ground"
 """What an effect `needs` that a robot on a fixed base cannot show."""
-FIXED_BASE = "a fixed base"
-"""What an effect `needs` that would hold a robot that walks away."""
 COMMANDS = "commands that are replayed"
 """What an effect `needs` whose variable would else be the torque that it is to explain."""
 

@@ -43,7 +43,7 @@ from sysid_btr.terms.sensing import (
     TorqueScale,
 )
 from sysid_btr.terms.servo import ActuatorFilter, BackEmf, CommandDelay, IntegralGain, Kp, Kv, TorqueConstant
-from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow, Tether
+from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
 ENTRY_POINTS = "sysid_btr.terms"
@@ -77,7 +77,6 @@ BUILT_IN: tuple[type[Term], ...] = (
     JointSpring,
     JointStop,
     JointStopBelow,
-    Tether,
     EncoderOffset,
     EncoderOffsetInLoop,
     EncoderScale,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -10,25 +9,12 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import BatchModel, Fields, Kind
-from sysid_btr.terms.effect import FIXED_BASE, Effect, Probe
+from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import JointScale
 
 if TYPE_CHECKING:
     import mujoco
-
-ANCHOR, TIED = "__anchor", "__tied"
-"""Endings of the names of a tether's ends, in the world and on the body."""
-
-
-def averaged(kinds: Sequence[Kind], probe: Probe, amounts: FloatArray) -> FloatArray | None:
-    """Values (kinds,) of the one spring that equal ones, times amounts, are together; None where they push."""
-    total = float(np.sum(amounts))
-    if total <= 0.05 * float(np.sum(np.abs(amounts))):
-        return None
-    values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
-    values[0] *= total
-    return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -70,7 +56,13 @@ class JointSpring(Effect):
     @classmethod
     def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
         """The probe's directions are equal springs at several places: amounts add, places average."""
-        return averaged(cls.sized(scale), probe, amounts)
+        total = float(np.sum(amounts))
+        if total <= 0.05 * float(np.sum(np.abs(amounts))):
+            return None
+        kinds = cls.sized(scale)
+        values = np.array([np.dot(amounts, [d[i] for d in probe]) / total for i in range(len(kinds))])
+        values[0] *= total
+        return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
 
     @classmethod
     def own_value(cls, model: mujoco.MjModel, place: str) -> float:
@@ -89,8 +81,6 @@ class JointSpring(Effect):
         return {"jnt_stiffness": stiffness, "qpos_spring": rest}
 
 
-FAR = 1.0
-"""Distance, m, from the origin of a point to which a body can be tied."""
 ONSETS = (-0.3, -0.1, 0.1, 0.3)
 """Where a scan looks for a stop, from the middle of the motion in spans of it."""
 
@@ -147,73 +137,3 @@ class JointStopBelow(JointStop):
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
         for p, j in enumerate(places):
             step.joint_torque[j] += numbers[p, 0] * max(numbers[p, 1] - step.qpos[j], 0.0)
-
-
-@dataclass(frozen=True)
-class Tether(Effect):
-    """A body tied to a fixed point beside the robot: a rubber band, a harness of cables, the rope of a gantry.
-
-    Native: a tendon from the body's centre of mass to the point, which pulls in proportion to what it is longer than
-    its length.
-    """
-
-    name: ClassVar[str] = "tether"
-    family: ClassVar[str] = "spring"
-    title: ClassVar[str] = "tether to a point beside the robot"
-    scope: ClassVar = "body"
-    needs: ClassVar[str] = FIXED_BASE
-    signed: ClassVar[bool] = True
-    kinds: ClassVar[tuple[Kind, ...]] = (
-        Kind("stiffness", "N/m", 0.0, 0.0, 200.0, 1.0),
-        *(Kind(axis, "m", 0.0, -2.0, 2.0, 0.05) for axis in "xyz"),
-        Kind("length", "m", 0.0, 0.0, 2.0, 0.05),
-    )
-    held: ClassVar[tuple[str, ...]] = ("length",)
-    details: ClassVar[tuple[str, ...]] = held
-    includes: ClassVar[tuple[str, ...]] = ("constant_force",)
-    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("payload", "motion that turns the body and does not move it"),
-        ("joint_spring", "motion of the joints before it"),
-    )
-
-    @classmethod
-    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
-        k, d = cls.kinds[0].scale, 0.3
-        return (tuple((k, *at, 0.0) for at in ((0.0, 0.0, 0.0), (d, 0.0, 0.0), (0.0, d, 0.0), (0.0, 0.0, d))),)
-
-    @classmethod
-    def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
-        """The probe's directions are equal springs to several points: amounts add, points average."""
-        kinds = cls.sized(scale)
-        pull = np.dot(amounts, [[d[0] * x for x in d[1:4]] for d in probe])
-        stiffness, size = probe[0][0] * float(np.sum(amounts)), float(np.linalg.norm(pull))
-        if size > FAR * max(stiffness, 0.0):
-            # how it changes with the motion hardly shows: begin from one that pulls as hard from far away
-            values = np.array([size / FAR, *(FAR * pull / max(size, 1e-300)), 0.0])
-            return np.array([np.clip(v, k.lower, k.upper) for v, k in zip(values, kinds, strict=True)])
-        return averaged(kinds, probe, amounts)
-
-    @property
-    def begin(self) -> FloatArray:
-        """A weak one: where there is none, nothing responds to its place."""
-        kinds = self.numbers * len(self.groups)
-        pairs = zip(kinds, self.parameters, strict=True)
-        return np.array([p.scale if k.name == "stiffness" else p.nominal for k, p in pairs])
-
-    def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        plain = spec.copy().compile()
-        for name in self.places:
-            if spec.tendon(name + TIED) is not None:
-                continue
-            spec.worldbody.add_site(name=name + ANCHOR, pos=[1.0, 1.0, 1.0])
-            spec.body(name).add_site(name=name + TIED, pos=plain.body(name).ipos)
-            tendon = spec.add_tendon(name=name + TIED, springlength=[0.0, 0.0])
-            tendon.wrap_site(name + ANCHOR)
-            tendon.wrap_site(name + TIED)
-
-    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        sites = [batch.model.site(name + ANCHOR).id for name in self.places]
-        tendons = [batch.model.tendon(name + TIED).id for name in self.places]
-        at, stiffness, free = (batch.read(n) for n in ("site_pos", "tendon_stiffness", "tendon_lengthspring"))
-        stiffness[:, tendons], at[:, sites], free[:, tendons, 1] = values[:, :, 0], values[:, :, 1:4], values[:, :, 4]
-        return {"site_pos": at, "tendon_stiffness": stiffness, "tendon_lengthspring": free}

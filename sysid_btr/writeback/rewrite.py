@@ -379,7 +379,7 @@ def _general(now: Compiled, target: mujoco.MjModel, i: int, element: Element) ->
 
 
 def add_structure(now: Compiled, target: mujoco.MjModel, notes: Mapping[tuple[Kind, str], str]) -> bytes:
-    """The text with the bodies, joints, sites and tendons that the wanted model has more."""
+    """The text with the bodies, joints and tendons that the wanted model has more."""
     edits: list[Edit] = []
     bodies = {now.model.body(i).name: i for i in range(now.model.nbody)}
     children: dict[int, list[str]] = {}
@@ -387,14 +387,8 @@ def add_structure(now: Compiled, target: mujoco.MjModel, notes: Mapping[tuple[Ki
         if target.body(i).name not in bodies:
             parent = bodies[target.body(int(target.body_parentid[i])).name]
             children.setdefault(parent, []).extend([*_note(notes, "body", target.body(i).name), _body(target, i)])
-    sites = {now.model.site(i).name for i in range(now.model.nsite)}
-    for i in range(target.nsite):
-        if target.site(i).name not in sites | {""}:
-            site = element_text("site", {"name": target.site(i).name, "pos": numbers(target.site_pos[i])})
-            children.setdefault(bodies[target.body(int(target.site_bodyid[i])).name], []).append(site)
     for parent, pieces in children.items():
-        world = [child for child in now.root.children if child.tag == "worldbody"][:1]
-        edits.append(append_child(now.text, world[0] if world and not parent else now.at("body", parent), pieces))
+        edits.append(append_child(now.text, now.at("body", parent), pieces))
     joints = {now.model.joint(i).name for i in range(now.model.njnt)}
     added = [i for i in range(target.njnt) if target.joint(i).name and target.joint(i).name not in joints]
     by_body: dict[int, list[str]] = {}
@@ -453,19 +447,14 @@ def _joint(now: Compiled, target: mujoco.MjModel, i: int) -> str:
 
 
 def _tendon(target: mujoco.MjModel, i: int) -> str:
-    """A fixed tendon over joints, such as one that damps both sides of a gear, or one between sites that pulls."""
-    import mujoco
-
+    """A fixed tendon over joints, such as one that damps both sides of a gear."""
     first, size = int(target.tendon_adr[i]), int(target.tendon_num[i])
-    over = [(int(target.wrap_objid[w]), target.wrap_prm[w]) for w in range(first, first + size)]
-    if target.wrap_type[first] == mujoco.mjtWrap.mjWRAP_SITE:
-        ends = [element_text("site", {"site": target.site(site).name}) for site, _ in over]
-        pull = {
-            "stiffness": number(np.ravel(target.tendon_stiffness[i])[0]),
-            "springlength": numbers(target.tendon_lengthspring[i]),
-        }
-        return element_text("spatial", {"name": target.tendon(i).name, **pull}, ends)
-    wraps = [element_text("joint", {"joint": target.joint(j).name, "coef": number(by)}) for j, by in over]
+    wraps = [
+        element_text(
+            "joint", {"joint": target.joint(int(target.wrap_objid[w])).name, "coef": number(target.wrap_prm[w])}
+        )
+        for w in range(first, first + size)
+    ]
     damping = numbers([target.tendon_damping[i], *target.tendon_dampingpoly[i]])
     return element_text("fixed", {"name": target.tendon(i).name, "damping": damping}, wraps)
 
