@@ -38,7 +38,7 @@ def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress
         study, coarse = first_fit(recorded, coarse.model, budget.after(spent), progress)
         coarse = replace(coarse, evaluations=coarse.evaluations + spent)
     if float(coarse.train_columns.max()) > MISFIT:
-        coarse = _with_room(study, coarse, budget, progress)
+        coarse = _explained_beyond(study, coarse, budget, progress)
     if float(coarse.train_columns.max()) > MISFIT:
         if not study.procedure.weighs_segments:
             study, coarse = robust_refit(study, coarse, ROBUST_ROUNDS, budget, progress)
@@ -49,8 +49,8 @@ def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress
     return study, coarse
 
 
-def _with_room(study: Study, coarse: Fitted, budget: Budget, progress: Progress) -> Fitted:
-    """A first fit within bounds that are wide enough: what they keep it from explaining is no error of the model."""
+def _explained_beyond(study: Study, coarse: Fitted, budget: Budget, progress: Progress) -> Fitted:
+    """A first fit, beyond bounds that nobody stated where it explains the log there: no error of the model then."""
     model, spent = coarse.model, coarse.evaluations
     if not on_bounds(model).any():
         return coarse
@@ -58,7 +58,9 @@ def _with_room(study: Study, coarse: Fitted, budget: Budget, progress: Progress)
     residual, jacobian = linearise(problem, model.values, step=step)
     spent += 2 * len(model.values) + 1
     at, more = grow_bounds(study, Optimum(problem, model.values, jacobian, residual), budget.after(spent), progress)
-    return judge(study, at.problem.model.at(at.values), spent + more) if more else replace(coarse, evaluations=spent)
+    spent += more
+    wider = judge(study, at.problem.model.at(at.values), spent) if more else coarse
+    return replace(wider if float(wider.train_columns.max()) <= MISFIT else coarse, evaluations=spent)
 
 
 def realise_servo(study: Study, model: Model) -> Study:
