@@ -205,7 +205,7 @@ def _form(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale, 
     half = NORMAL * np.sqrt(np.einsum("nk,kl,nl->n", modes, curve.covariance, modes))
     hypothesis = Hypothesis(effect, (joint,), False, start, share * float(sum(weights)))
     term = effect.at((joint,), {joint: scale})
-    noun, _, rest = effect.title.partition(" that ")
+    noun, _, rest = term.described.partition(" that ")
     sentence = f"{effect.article}{noun} at {joint} that {rest}: {term.in_words(joint, start)}"
     return FreeForm(hypothesis, share, x, line, line - half, line + half, sentence)
 

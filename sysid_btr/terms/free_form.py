@@ -137,6 +137,12 @@ def in_speeds(x: Any, high: Any) -> Any:
     return np.arcsinh(np.minimum(np.abs(x) / high, 1.0) / CREEP) / np.arcsinh(1.0 / CREEP)
 
 
+@used_in_laws
+def gain_at(time: float, numbers: FloatArray) -> float:
+    """Gain of a drive whose change is a curve over time; `numbers` are the ends of its range, and its splines."""
+    return max(1.0 + spline(numbers[2:], in_range(time, numbers[0], numbers[1])), 0.0)
+
+
 def _kinds(bounds: Sequence[float], peak: float, size: float, unit: str = "Nm") -> tuple[Kind, ...]:
     return tuple(Kind(f"c{k}", unit, 0.0, -w * peak, w * peak, w * size) for k, w in enumerate(bounds, start=1))
 
@@ -238,7 +244,7 @@ class FreeCurve(Effect):
     def _units(self) -> tuple[str, str]:
         """Of what is given, and of the variable."""
         own, across = self.parameters[0].unit, self.variable_unit
-        return own, across if own == self.kinds[0].unit else SLIDE_UNITS.get(across, across)
+        return own, SLIDE_UNITS.get(across, across) if self.slides else across
 
     def in_words(self, place: str, values: FloatArray) -> str:
         unit, across = self._units
@@ -527,8 +533,7 @@ class FreeGainTime(FreeCurve):
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
         for p, j in enumerate(places):
-            own = numbers[p]
-            step.gain[j] *= max(1.0 + spline(own[2:], in_range(step.time, own[0], own[1])), 0.0)
+            step.gain[j] *= gain_at(step.time, numbers[p])
 
 
 @dataclass(frozen=True)
@@ -548,8 +553,7 @@ class FreeGainOfAll(FreeGainTime):
 
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
-        own = numbers[0]
-        gain = max(1.0 + spline(own[2:], in_range(step.time, own[0], own[1])), 0.0)
+        gain = gain_at(step.time, numbers[0])
         for j in places:
             step.gain[j] *= gain
 
@@ -687,6 +691,16 @@ class FreeReading(FreeCurve):
         reach = 0.3 * scale.span if scale.slide else 0.3
         return _kinds(modal_bounds(SPLINES), reach, reach / 60, "rad")
 
+    @staticmethod
+    def seen(outputs: Outputs, columns: IntArray) -> FloatArray:
+        """The variable at each sample and place, (..., places)."""
+        raise NotImplementedError
+
+    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
+        columns = batch.index.of(self.places)
+        modes = self.modes_at(self.seen(outputs, columns), *self._bounds)
+        outputs.position[:, :, columns] += modal_sum(values[:, None], modes)
+
 
 @dataclass(frozen=True)
 class FreeReadingPosition(FreeReading):
@@ -709,10 +723,9 @@ class FreeReadingPosition(FreeReading):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return FreeTorquePosition.range_of(scale)
 
-    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
-        columns = batch.index.of(self.places)
-        modes = self.modes_at(outputs.position[:, :, columns], *self._bounds)
-        outputs.position[:, :, columns] += modal_sum(values[:, None], modes)
+    @staticmethod
+    def seen(outputs: Outputs, columns: IntArray) -> FloatArray:
+        return outputs.position[:, :, columns]
 
 
 @dataclass(frozen=True)
@@ -736,11 +749,9 @@ class FreeReadingTime(FreeReading):
     def range_of(cls, scale: JointScale) -> tuple[float, float]:
         return 0.0, scale.seconds
 
-    def read_out(self, batch: BatchModel, values: FloatArray, outputs: Outputs) -> None:
-        low, high = self._bounds
-        for place, column in enumerate(batch.index.of(self.places)):
-            modes = self.modes_at(outputs.time, low[place], high[place])
-            outputs.position[:, :, column] += modal_sum(values[:, None, place], modes)
+    @staticmethod
+    def seen(outputs: Outputs, columns: IntArray) -> FloatArray:
+        return outputs.time[:, None]
 
 
 FREE_FORMS: tuple[type[FreeCurve], ...] = (

@@ -19,17 +19,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TorqueLimit(Effect):
-    """A servo that cannot give more than a certain torque.
-
-    Native: `actuator_forcerange`. No limit at the neutral value. A further limit stays within the model's own; as the
-    model's own, of both signs, it takes that one's place.
-    """
+class LimitedTorque(Effect):
+    """Base: a drive that cannot give more than a certain torque."""
 
     name: ClassVar[str] = "torque_limit"
     family: ClassVar[str] = "saturation"
-    field: ClassVar[str] = "force_limit"
-    title: ClassVar[str] = "limit of the torque"
     scope: ClassVar = "drive"
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("limit", "Nm", 100.0, 0.01, 100.0, 0.1),)
     held: ClassVar[tuple[str, ...]] = ("limit",)
@@ -37,6 +31,18 @@ class TorqueLimit(Effect):
         ("speed_torque_limit", "the limit reached at several speeds"),
         ("slew_limit", "slow motion under a large load"),
     )
+
+
+@dataclass(frozen=True)
+class TorqueLimit(LimitedTorque):
+    """A servo that cannot give more than a certain torque.
+
+    Native: `actuator_forcerange`. No limit at the neutral value. A further limit stays within the model's own; as the
+    model's own, of both signs, it takes that one's place.
+    """
+
+    field: ClassVar[str] = "force_limit"
+    title: ClassVar[str] = "limit of the torque"
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
@@ -69,14 +75,13 @@ class TorqueLimit(Effect):
 
 
 @dataclass(frozen=True)
-class TorqueLimitSoft(TorqueLimit):
+class TorqueLimitSoft(LimitedTorque):
     """A drive that gives the less of what it is asked for, the nearer that comes to a limit: iron that saturates.
 
     Law: torque = asked / sqrt(1 + (asked / limit)^2); none at its neutral value.
     """
 
     variant: ClassVar[str] = "soft"
-    field: ClassVar[str] = ""
     title: ClassVar[str] = "soft limit of the torque"
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
 
@@ -88,9 +93,6 @@ class TorqueLimitSoft(TorqueLimit):
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return tuple(((f * max(scale.torque_peak, 1e-9),),) for f in (2.0, 1.0, 0.5, 0.25))
-
-    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        return {}
 
     def law_numbers(self, values: FloatArray) -> FloatArray:
         return np.where(values >= self.neutral_of(0)[:, None], np.inf, values)
