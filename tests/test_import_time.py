@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -13,27 +12,17 @@ import sysid_btr
 SLOW = ("mujoco", "scipy", "pandas", "pyarrow", "matplotlib", "pydantic", "numpy")
 
 
-def test_import_takes_less_than_300_ms() -> None:
-    code = "import time; t = time.perf_counter(); import sysid_btr; print(time.perf_counter() - t)"
-    times = [
-        float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout)
-        for _ in range(3)
-    ]
-    assert min(times) < 0.3
-
-
-def test_help_takes_less_than_500_ms() -> None:
-    code = "import sys; from sysid_btr.cli import main; sys.argv = ['sysid-btr', '--help']; main()"
-    times = []
-    for _ in range(3):
-        began = time.perf_counter()
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-        times.append(time.perf_counter() - began)
-        assert done.returncode == 0, done.stderr
-        verbs = done.stdout.partition("Commands:")[2].partition("Exit codes:")[0]
-        assert "close" in verbs
-        assert "..." not in verbs, "what a verb does fits the line of a narrow terminal"
-    assert min(times) < 0.5
+def test_help_lists_the_verbs_and_imports_nothing_slow() -> None:
+    code = (
+        "import atexit, sys; from sysid_btr.cli import main; sys.argv = ['sysid-btr', '--help']; "
+        f"atexit.register(lambda: print('imported:', *(m for m in {SLOW!r} if m in sys.modules))); main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    verbs = done.stdout.partition("Commands:")[2].partition("Exit codes:")[0]
+    assert "close" in verbs
+    assert "..." not in verbs, "what a verb does fits the line of a narrow terminal"
+    assert done.stdout.splitlines()[-1] == "imported:"
 
 
 @pytest.mark.parametrize("module", ["sysid_btr", "sysid_btr.cli"])
