@@ -201,7 +201,10 @@ def widened(
     stated = Stated.of(parameters)
     slopes, off = np.diag(stated.weight), (values - stated.nominal) * stated.weight
     steep, rest = np.vstack([white[:, :-1], slopes]), np.concatenate([white[:, -1], off])
-    shift = newton(steep, rest)
+    # unknown torques may fit in the place of an effect of the model; beyond what was assumed of them that is no doubt
+    beside = np.pad(doubt.responses, ((0, len(slopes)), (0, 0)))
+    most = np.linalg.norm(newton(np.vstack([jacobian, slopes]), beside), axis=1)
+    shift = np.clip(newton(steep, rest), -most, most)
     apart = blocks.max() + 1 + np.arange(len(parameters))
     cov, _ = spread(steep, rest + steep @ shift, np.concatenate([blocks, apart]))
     std, together = np.sqrt(np.diag(cov)), correlations(cov)
