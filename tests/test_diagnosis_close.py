@@ -42,7 +42,7 @@ from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderCyclicError, EncoderOffset, SensorDelay
-from sysid_btr.terms.servo import CommandDelay, IntegralGain, Kp
+from sysid_btr.terms.servo import CommandDelay, CommandDelaySampled, IntegralGain, Kp
 from sysid_btr.terms.spring import JointSpring, JointStop
 from sysid_btr.terms.transmission import Backlash, Cogging, JointCompliance
 from sysid_btr.writeback.write import identified
@@ -306,6 +306,7 @@ PLANTS = [
     Plant(QuadraticDamping(KNEE), (0.06,)),
     Plant(Armature(KNEE), (0.01,)),
     Plant(CommandDelay(toys.LEG_JOINTS, shared=True), (0.025,)),
+    Plant(CommandDelaySampled(KNEE), (0.045, 0.02)),
     Plant(Backlash(KNEE), (0.03, 0.001)),
     Plant(JointCompliance(KNEE), (0.03,), rivals=("backlash",)),
     Plant(JointSpring(KNEE), (1.0, 0.3), rivals=("encoder_scale",)),

@@ -30,6 +30,7 @@ from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.servo import sampled
 from sysid_btr.terms.transmission import Cogging
 
 NOISE = 4e-4
@@ -352,6 +353,36 @@ def test_a_pulse_is_found_in_noise(start: int, length: int, seed: int) -> None:
     assert box is not None
     assert abs(box.start - start) <= 2
     assert abs(box.stop - start - length) <= 2
+
+
+@pytest.mark.parametrize("seconds", [6.0, 40.0])
+@pytest.mark.parametrize(("period", "start"), [(0.0484, 0.032), (0.03, 0.009), (0.11, 0.1)])
+def test_intervals_between_commands_are_seen_in_the_torque(seconds: float, period: float, start: float) -> None:
+    """Between samples of the log, in noise, and beside a delay of any size."""
+    fine = np.arange(round(seconds * 1000) + 1) * 1e-3
+    time = fine[:-1:10]
+    rng = np.random.default_rng(1)
+    waves = rng.normal(size=4) * np.sin(2 * np.pi * np.outer(time, [0.3, 0.7, 1.1, 1.9]) + rng.uniform(0, 6, 4))
+    command = waves.sum(axis=1)
+    taken = sampled(np.repeat(command, 10)[None], fine[None], period, start)[0].reshape(-1, 10).mean(axis=1)
+    rate = np.gradient(command) / np.linalg.norm(np.gradient(command))
+
+    def beside_a_delay(x: FloatArray) -> FloatArray:
+        return np.asarray(x - rate[:, None] * (rate @ x))
+
+    torque = beside_a_delay((taken - command)[:, None])[:, 0]
+    torque = torque + 0.3 * torque.std() * rng.normal(size=len(time))
+    found = signal_features.best_sampling(torque, command, time, beside_a_delay)
+    assert found is not None
+    assert found[0] == pytest.approx(period, abs=0.1 * period**2 / seconds)
+    assert found[1] == pytest.approx(start, abs=0.05 * period)
+    assert found[2] > 0.85
+
+
+def test_no_intervals_between_commands_are_seen_in_noise() -> None:
+    time = np.arange(900) * 0.01
+    found = signal_features.best_sampling(noise(900), np.sin(3 * time), time, lambda x: x)
+    assert found is None or found[2] < 0.05
 
 
 @settings(max_examples=15, deadline=None)

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.optimize import brentq
 from toys import (
     ARMATURE,
@@ -61,7 +63,7 @@ from sysid_btr.terms.sensing import (
     TorqueOffset,
     TorqueScale,
 )
-from sysid_btr.terms.servo import BackEmf, CommandDelay, IntegralGain
+from sysid_btr.terms.servo import BackEmf, CommandDelay, CommandDelaySampled, IntegralGain, sampled
 from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
@@ -130,6 +132,30 @@ def test_a_command_delay_leaves_a_push_where_it_is() -> None:
     push = at_arm(ExternalDisturbance)
     both = position(pendulum(), held(), [at_arm(CommandDelay), push], [0.05, 0.5, 0.2, 0.1])
     np.testing.assert_array_equal(both, position(pendulum(), held(), [push], [0.5, 0.2, 0.1]))
+
+
+def test_commands_taken_at_intervals_are_those_of_a_log_that_holds_them() -> None:
+    """At 7, 57, 107, .. ms: between samples of the log, and between steps of the replay."""
+    log = swing(seconds=1.5)
+    taken = position(pendulum(), log, [at_arm(CommandDelaySampled)], [0.05, 0.007], numerics=Numerics("RK4", 0.002))
+    time = np.arange(1501) * 1e-3
+    moment = np.maximum(0.007 + np.floor((time - 0.007) / 0.05 + 1e-9) * 0.05, 0.0)
+    command = log.channels["command.arm"][np.floor(moment / 0.01 + 1e-9).astype(int)]
+    wanted = position(pendulum(), make_log(time, {"command.arm": command}))[::10]
+    assert np.abs(taken - wanted).max() < 1e-4
+    assert np.abs(position(pendulum(), log) - wanted).max() > 1e-2
+
+
+@given(period=st.floats(0.012, 0.19), phase=st.floats(0.0, 1.0), lead=st.integers(0, 40))
+def test_what_was_commanded_before_a_replay_begins_is_taken_as_if_it_had_begun_then(
+    period: float, phase: float, lead: int
+) -> None:
+    time = np.arange(401) * 0.005
+    command = np.sin(7 * time[:-1])[None]
+    whole = sampled(command, time[None], period, phase * period)
+    late = sampled(command[:, 100 - lead :], time[None, 100 - lead :], period, phase * period)
+    settled = lead + 2 * int(period / 0.005)
+    np.testing.assert_allclose(late[:, settled:], whole[:, 100 - lead + settled :], atol=1e-12)
 
 
 def test_an_encoder_offset_in_the_log_shifts_what_is_seen_and_nothing_else() -> None:

@@ -80,7 +80,7 @@ class Belief:
         found: list[Term] = []
         for effect in select_effects([name for name in UNMEASURED if name not in there] or ["all"]):
             places = robot.names(effect.scope)
-            asked = effect.name in UNMEASURED and (ground or effect.needs != GROUND)
+            asked = effect.name in UNMEASURED and not effect.variant and (ground or effect.needs != GROUND)
             if asked and effect.name not in there and places:
                 found.append(effect(places=places, shared=len(places) > 1))
         size = {DRY: _stiffness(robot)}

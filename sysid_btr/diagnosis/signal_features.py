@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.terms.servo import sampled
 
 GROW = 1.25
 """Ratio of neighbouring pulse lengths that are tried."""
@@ -19,6 +20,12 @@ REPEATS = 4
 MOST_PERIODS = 6000
 NEGLIGIBLE = 1e-8
 """Singular value, relative to the largest, of a direction that columns of a design do not have."""
+FASTEST, SLOWEST = 0.01, 0.2
+"""Seconds between commands that a drive takes: hobby servos to slow buses. What is faster is a delay."""
+GLANCE = 8.0
+"""Seconds of a log in which these are sought first."""
+STARTS, MOST_PEAKS, NEAR, REFINEMENTS = 8, 6, 7, 3
+"""Parts of a period in which the first command may be taken; periods that are refined, from how many, how often."""
 SHORTER = 0.8
 """A shorter period is preferred if it explains at least this fraction of what the best one does."""
 
@@ -161,6 +168,78 @@ def best_train(signal: FloatArray, time: FloatArray, period: float) -> Train:
         scale *= 0.6
     first = float(np.mod(train[0], train[2]))
     return Train(first, float(train[1]), float(train[2]), best[1], best[0])
+
+
+def best_sampling(
+    torque: FloatArray, command: FloatArray, time: FloatArray, seen: Callable[[FloatArray], FloatArray]
+) -> tuple[float, float, float] | None:
+    """How a drive that takes its command only now and then would leave this torque: period, first moment, share of it.
+
+    Parameters
+    ----------
+    torque, command : (n,).
+    time : (n,) s, at equal intervals, from 0.
+    seen : torques (n, k) as an estimate of `torque` would show them.
+
+    Returns
+    -------
+    tuple or None
+        None where no period does.
+    """
+    step, total = float(time[1] - time[0]), float(torque @ torque)
+    count = min(round(GLANCE / step), len(time))
+    first = int(np.argmax(np.convolve(np.diff(command, append=command[-1]) ** 2, np.ones(count), "valid")))
+    glance = slice(first, first + count, max(int(0.5 * FASTEST / step), 1))
+    # neighbouring periods drift apart by a quarter of one over the glance
+    rates = np.arange(1 / SLOWEST, 1 / max(2 * step, FASTEST), 0.25 / (count * step))
+    if len(rates) < 3 or total == 0:
+        return None
+    shares = np.array([_sampled_shares(torque[glance], command[glance], time[glance], 1 / r) for r in rates])
+    most = shares.max(axis=1)
+    peaks = 1 + np.flatnonzero((most[1:-1] > most[:-2]) & (most[1:-1] >= most[2:]))
+    peaks = peaks[np.argsort(-most[peaks])[:MOST_PEAKS]]
+    borders = np.append(time, time[-1] + step)[None]
+
+    def refined(period: float, start: float, rows: slice) -> tuple[float, float, float]:
+        """Share of the torque in some rows, period, and first moment near a guess."""
+        many, own = np.broadcast_to(command, (NEAR**2, len(command))), torque[rows]
+        # seen from the middle of what is looked at, moments and period are independent
+        middle, change = 0.5 * (time[rows][0] + time[rows][-1]), np.linspace(-1, 1, NEAR)
+        for _ in range(REFINEMENTS):
+            near = start + np.round((middle - start) / period) * period
+            wide = 0.25 * period**2 / (step * len(own)), period / STARTS
+            periods, nears = (x.ravel() for x in np.meshgrid(period + change * wide[0], near + change * wide[1]))
+            starts = np.mod(nears, periods)
+            shown = seen((sampled(many, borders, periods[:, None], starts[:, None]) - command).T)[rows]
+            size = np.einsum("nk,nk->k", shown, shown) * float(own @ own)
+            share = np.maximum(own @ shown, 0.0) ** 2 / np.maximum(size, 1e-300)
+            k = int(np.argmax(share))
+            period, start, change = float(periods[k]), float(starts[k]), 0.4 * change
+        return float(share[k]), period, start
+
+    rows = slice(first, first + count)
+    guesses = [(1 / float(rates[p]), int(np.argmax(shares[p])) / STARTS / float(rates[p])) for p in peaks]
+    share, period, start = max((refined(*guess, rows) for guess in guesses), default=(0.0, 0.0, 0.0))
+    while share > 0 and rows != slice(0, len(time)):
+        longer = (rows.stop - rows.start) // 2
+        rows = slice(max(rows.start - longer, 0), min(rows.stop + longer, len(time)))
+        share, period, start = refined(period, start, rows)
+    return (period, start, share) if share > 0 else None
+
+
+def _sampled_shares(torque: FloatArray, command: FloatArray, time: FloatArray, period: float) -> FloatArray:
+    """Share of a torque that commands taken once a period explain, by the first moment in it, (STARTS,)."""
+    bins = np.arange(STARTS)
+    lag = period / STARTS * (bins[:, None] + 0.5)
+    late = np.interp(time - lag, time, command) - command
+    label = np.floor(time * (STARTS / period)).astype(np.int64) % STARTS * STARTS + bins[:, None]
+    inner, size = (
+        np.bincount(label.ravel(), x.ravel(), STARTS**2).reshape(STARTS, STARTS) for x in (torque * late, late**2)
+    )
+    # in which part of the period a sample is, and how late its command is then if these are taken in another part
+    part, taken = bins[:, None], (bins[:, None] - bins) % STARTS
+    square = np.maximum(inner[part, taken].sum(axis=0), 0.0) ** 2
+    return np.asarray(square / np.maximum(size[part, taken].sum(axis=0) * float(torque @ torque), 1e-300))
 
 
 def _circular_box(sums: FloatArray, count: FloatArray) -> tuple[int, int]:

@@ -15,7 +15,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
 from sysid_btr.diagnosis.scan import Perturbation
-from sysid_btr.diagnosis.signal_features import Line, Train, hats, predicted_share, without
+from sysid_btr.diagnosis.signal_features import Line, Train, best_sampling, hats, predicted_share, without
 from sysid_btr.identify.missing_torque import MissingTorque, missing_torques
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem
@@ -23,6 +23,7 @@ from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturban
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderCyclicError
+from sysid_btr.terms.servo import CommandDelaySampled
 from sysid_btr.terms.transmission import Cogging
 
 LOUD = 1.3
@@ -39,7 +40,7 @@ OUTLIER = 3.0
 EVEN = 0.3
 """Difference, relative to a pulse, below which pulses and gaps are equally far from no torque."""
 TRAIN_SHARE = 0.15
-"""Share of the variance that a pulse train must explain to be proposed."""
+"""Share of the variance that a pulse train, or intervals between commands, must explain to be proposed."""
 LINE_SHARE, LINE_CLEAR = 0.03, 8.0
 """Share of the variance that a spatial frequency must explain, alone and relative to the median one."""
 LINES = 2
@@ -56,7 +57,7 @@ NEARLY = 0.07
 WEAK = 0.2
 """Share of the missing torque below which a dependence is none."""
 DESCRIBED = 3
-"""Joints that are described."""
+"""Joints that are described, and in whose torque intervals between commands are sought."""
 
 
 def proposals(
@@ -72,21 +73,24 @@ def proposals(
     library : effects that may be asked for.
     """
     pushes = {ExternalDisturbance, ExternalDisturbanceTrain, DriveDisturbanceTrain}
-    wanted = {Cogging, EncoderCyclicError, *pushes} & set(library)
+    wanted = {Cogging, EncoderCyclicError, CommandDelaySampled, *pushes} & set(library)
     if not wanted or not np.any(problem.column_chi2(residual) >= LOUD):
         return []
     asked: list[Perturbation] = []
     torques = missing_torques(problem, values, study.scales)
     worst = max((_blame(t) for t in torques), default=0.0)
-    for one in torques:
-        if one.chi2 < LOUD or _blame(one) < SMALL * worst:
-            continue
+    loud = [t for t in torques if t.chi2 >= LOUD and _blame(t) >= SMALL * worst]
+    worst_first = sorted(loud, key=_blame, reverse=True)
+    for one in loud:
         scale, place = study.scales[one.joint], (one.joint,)
         if Cogging in wanted:
             asked += [Perturbation(Cogging, place, Cogging.probe_at(scale, x.number)) for x in spatial_lines(one)]
         if EncoderCyclicError in wanted:
             numbers = (*ONCE_AND_TWICE, *(x.number for x in spatial_lines(_of_reading(one))))
             asked += [Perturbation(EncoderCyclicError, place, EncoderCyclicError.probe_at(scale, n)) for n in numbers]
+        moments = sampling(one) if CommandDelaySampled in wanted and one in worst_first[:DESCRIBED] else None
+        if moments is not None:
+            asked.append(Perturbation(CommandDelaySampled, place, CommandDelaySampled.probe_at(*moments)))
         push = single_pulse(one) if ExternalDisturbance in wanted else None
         # pulses of a train that differ are no pushes that come again: what they follow is something else
         if push is not None and not _within_train(problem, values, one.joint, *push):
@@ -164,6 +168,13 @@ def spatial_lines(one: MissingTorque) -> list[Line]:
         at = int(np.argmax(sharper))
         lines.append(Line(float(near[at]), float(sharper[at])))
     return lines
+
+
+def sampling(one: MissingTorque) -> tuple[float, float] | None:
+    """Period and first moment at which a drive takes its command, where that would explain what a delay leaves."""
+    rest = one.beside(np.gradient(one.command)[:, None])
+    found = best_sampling(rest.torque, rest.command, rest.time, rest.seen)
+    return found[:2] if found is not None and found[2] >= TRAIN_SHARE else None
 
 
 def single_pulse(one: MissingTorque) -> tuple[float, float] | None:

@@ -107,7 +107,8 @@ class MissingTorque:
     def beside(self, columns: FloatArray) -> MissingTorque:
         """The estimate without what torques (n, k), in any amounts, can do to it."""
         basis = orthonormal(self.seen(columns))
-        return replace(self, torque=self.torque - basis @ (basis.T @ self.torque), taken=basis)
+        taken = np.hstack([self.taken, basis]) if self.taken.size else basis
+        return replace(self, torque=self.torque - basis @ (basis.T @ self.torque), taken=taken)
 
 
 def smooth_sign(signal: FloatArray) -> FloatArray:

@@ -136,11 +136,12 @@ def prepare(
     if extra is not None and extra.shape[-1] > controls:
         command = command + fed_forward(batch, *np.split(extra[..., controls:], 2, axis=-1))
     applied: FloatArray | None = None
-    borders = np.atleast_1d(first)[:, None] + np.arange(command.shape[1] - lead + 1, dtype=np.float64)
+    steps = np.atleast_1d(first)[:, None] + np.arange(-lead, command.shape[1] - lead + 1, dtype=np.float64)
+    time = batch.timestep * steps
     for term, values in pairs:
         term.initial_state(batch, values, qpos, qvel)
-        command = term.shape_command(batch, values, command)
-        torque = term.applied_torque(batch, values, batch.timestep * borders)
+        command = term.shape_command(batch, values, command, time)
+        torque = term.applied_torque(batch, values, time[:, lead:])
         if torque is not None:
             applied = torque if applied is None else applied + torque
     command = lagged(batch, command)

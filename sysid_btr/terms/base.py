@@ -367,8 +367,11 @@ class Term:
             return 0.0
         return max((p.upper for p in self.parameters if p.unit == "s"), default=0.0)
 
-    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
-        """Transform the commands that reach the servos, (m, steps, joints of the log)."""
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
+        """Transform the commands that reach the servos, (m, steps, joints of the log).
+
+        `time` (m or 1, steps + 1) is that of the borders of the steps, s since the first sample of the log.
+        """
         return command
 
     def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:

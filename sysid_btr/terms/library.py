@@ -42,7 +42,16 @@ from sysid_btr.terms.sensing import (
     TorqueOffset,
     TorqueScale,
 )
-from sysid_btr.terms.servo import ActuatorFilter, BackEmf, CommandDelay, IntegralGain, Kp, Kv, TorqueConstant
+from sysid_btr.terms.servo import (
+    ActuatorFilter,
+    BackEmf,
+    CommandDelay,
+    CommandDelaySampled,
+    IntegralGain,
+    Kp,
+    Kv,
+    TorqueConstant,
+)
 from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
@@ -66,6 +75,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     BackEmf,
     Armature,
     CommandDelay,
+    CommandDelaySampled,
     ActuatorFilter,
     SensorDelay,
     DriveCoupling,

@@ -179,7 +179,7 @@ class SlewLimit(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return tuple(((f * max(scale.velocity_peak, 1e-9),),) for f in (0.9, 0.7, 0.5, 0.3))
 
-    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
         shaped = np.array(command)
         columns = batch.index.of(self.places)
         wanted = shaped[:, :, columns]

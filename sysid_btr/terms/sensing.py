@@ -52,7 +52,7 @@ class EncoderOffsetInLoop(EncoderOffset):
 
     variant: ClassVar[str] = "loop"
 
-    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
         shaped, columns = command.copy(), batch.index.of(self.places)
         # nothing but a command of position is compared with what the encoder shows
         fed = batch.index.driven_by("position")[columns]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import BatchModel, Fields, Kind, Scope
 from sysid_btr.terms.drives import joint_drives
-from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.effect import COMMANDS, Effect, Probe
 from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import JointScale
 
@@ -236,8 +236,85 @@ class CommandDelay(Effect):
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
         return (((0.008,),), ((0.025,),))
 
-    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
         return delay_command(command, batch.index.of(self.places), values[:, :, 0] / batch.timestep)
+
+
+@dataclass(frozen=True)
+class CommandDelaySampled(Effect):
+    """A servo that takes its command only now and then, at equal intervals, and holds it between: late by half of one.
+
+    Command: that of the last moment `start` + k `period` in each step; exact for commands that are held over steps.
+    """
+
+    name: ClassVar[str] = "command_delay"
+    family: ClassVar[str] = "delay"
+    variant: ClassVar[str] = "sampled"
+    title: ClassVar[str] = "commands taken only at intervals"
+    scope: ClassVar = "drive"
+    held: ClassVar[tuple[str, ...]] = ("period", "start")
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("period", "s", 0.0, 0.0, 0.2, 0.004),
+        Kind("start", "s", 0.0, -0.2, 0.4, 0.004),
+    )
+    needs: ClassVar[str] = COMMANDS
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("command_delay", "samples that come more often than the servo takes its commands"),
+    )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return ()
+
+    @classmethod
+    def probe_at(cls, period: float, start: float) -> Probe:
+        """A probe at moments that the residual proposes."""
+        return ((period, start),)
+
+    @classmethod
+    def is_threshold(cls) -> bool:
+        return False  # though a scan takes its moments as they are proposed
+
+    @classmethod
+    def initial_guesses(cls, values: FloatArray) -> FloatArray:
+        return values[None]
+
+    def around(self, values: FloatArray) -> Self:
+        """The same with times bounded near a guess (parameters,): elsewhere the moments are those of other commands."""
+        reach = np.outer(values[:: len(self.kinds)], (0.02, 0.25)).ravel()
+        known = []
+        for parameter, value, most in zip(self.parameters, values, reach, strict=True):
+            low, high = max(value - most, parameter.lower), min(value + most, parameter.upper)
+            known.append(
+                replace(parameter, nominal=float(np.clip(parameter.nominal, low, high)), lower=low, upper=high)
+            )
+        return replace(self, known=tuple(known))
+
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
+        shaped = np.array(np.broadcast_to(command, (len(values), *command.shape[1:])))
+        for place, column in enumerate(batch.index.of(self.places)):
+            rows = np.flatnonzero(values[:, place, 0] > batch.timestep)
+            period, start = values[rows, place, 0, None], values[rows, place, 1, None]
+            borders = np.broadcast_to(time, (len(values), time.shape[1]))[rows]
+            shaped[rows, :, column] = sampled(shaped[rows, :, column], borders, period, start)
+        return shaped
+
+
+def sampled(command: FloatArray, time: FloatArray, period: FloatArray | float, start: FloatArray | float) -> FloatArray:
+    """What a servo makes of held commands (m, n) that takes one at `start` + k `period`: means over the steps, (m, n).
+
+    `time` (m or 1, n + 1) is that of the borders of the steps. Before it has taken one it has the first.
+    """
+    begin, end = time[:, :-1], time[:, 1:]
+    last = start + np.floor((end - start) / period) * period
+    newest = np.clip((end - last) / (end - begin), 0.0, 1.0)
+
+    def at(moment: FloatArray) -> FloatArray:
+        step = np.floor((moment - begin[:, :1]) / (end - begin)[:, :1] + 1e-9).astype(np.int64)
+        rows = np.broadcast_to(np.clip(step, 0, command.shape[1] - 1), command.shape)
+        return np.asarray(np.take_along_axis(command, rows, axis=1))
+
+    return np.asarray(newest * at(last) + (1 - newest) * at(last - period))
 
 
 def delay_command(command: FloatArray, columns: IntArray, steps: FloatArray) -> FloatArray:

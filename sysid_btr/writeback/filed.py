@@ -35,7 +35,7 @@ class FilledBuffers(Term):
 
     name: ClassVar[str] = "filled_buffers"
 
-    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray) -> FloatArray:
+    def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
         import mujoco
 
         model, h = batch.model, batch.timestep
