@@ -218,7 +218,7 @@ def test_what_a_mode_cannot_do_is_said(arm: Robot) -> None:
 
 def test_what_no_single_sample_shows_is_refused_and_not_looked_for(arm: Robot) -> None:
     """Play and compliance need a second joint, hysteresis a past: torques of one instant know neither."""
-    study = study_of(with_motors(arm), moved())
+    study = make_study(with_motors(arm), [moved()], mode=Mode("inverse"), threads=1)
     for name in ("backlash", "joint_compliance"):
         with pytest.raises(UsageError, match=rf"{name}: .* --mode forward"):
             study.declare([f"{name}:elbow"])

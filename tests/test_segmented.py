@@ -115,6 +115,24 @@ def test_torques_that_swing_a_double_pendulum_round_ask_for_segments() -> None:
     assert "can be followed for" in facts["why"]
 
 
+@pytest.mark.parametrize("seed", [0, 3])
+def test_torques_alone_drive_what_swings(seed: int) -> None:
+    """Compared with those that the motion takes, they would make masses and friction too small, and sure of it."""
+    log = driven(seed)
+    torques = {name.replace("command.", "effort."): values for name, values in log.channels.items()}
+    study = make_study(double_pendulum(), [replace(log, channels=torques)], threads=1)
+    assert isinstance(study.train[0], SegmentedEpisode)
+    assert "less than the inertia takes" in study.train[0].facts()["why"]
+    found = fit(study, FREED)
+    for estimate, truth in zip(found.estimates, TRUTH, strict=True):
+        assert abs(estimate.value - truth) < 4 * estimate.std + 0.01 * truth
+        assert estimate.value == pytest.approx(truth, rel=0.05)
+    compared = fit(
+        make_study(double_pendulum(), [replace(log, channels=torques)], mode=Mode("inverse"), threads=1), FREED
+    )
+    assert max(abs(e.value / truth - 1) for e, truth in zip(compared.estimates, TRUTH, strict=True)) > 0.2
+
+
 def test_a_servo_takes_errors_back_so_that_the_log_is_replayed_whole() -> None:
     robot = pendulum()
     assert is_held(robot, swing())

@@ -101,8 +101,8 @@ class ModeOptions(Options):
         "How logs are compared: forward drives the model by their commands, segments does so from one measured state "
         "after the other, inverse compares the torques that the motion requires, innovations (of a floating base) each "
         "sample with its prediction from those before it.",
-        otherwise="auto: inverse where no command is logged, segments where the replay diverges from the log, "
-        "innovations for a floating base",
+        otherwise="auto: inverse where no command is logged and nothing swings by its weight, segments where "
+        "the replay diverges from the log, innovations for a floating base",
         metavar="auto|forward|segments|inverse|innovations",
         decides=True,
     )

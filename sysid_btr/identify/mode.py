@@ -15,8 +15,10 @@ from sysid_btr.errors import UsageError
 from sysid_btr.identify.driving import measured_torques
 from sysid_btr.identify.episode import Episode
 from sysid_btr.identify.horizon import is_held
+from sysid_btr.identify.inverse import InverseEpisode
 from sysid_btr.identify.segmented import follow
 from sysid_btr.io.log import COMMANDS, Log
+from sysid_btr.models.commands import drives_nothing
 from sysid_btr.models.robot import Robot, joint_names
 
 GIVEN = "driven by the measured torques, with which the plain model moves more like the log than with those commanded"
@@ -129,10 +131,21 @@ def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str
         return mode.asked, "as asked for"
     joints = joint_names(robot)
     if not _commanded(log) and any(log.has("effort", j) for j in joints):
-        return "inverse", "no command is logged"
+        swinging = log.once(("swinging", robot.fingerprint, robot.at), lambda: _swinging(robot, log, threads))
+        if not swinging:
+            return "inverse", "no command is logged"
+        less = f"at {', '.join(swinging)} they are less than the inertia takes, too little to be compared"
+        return "segments", f"no command is logged; the measured torques drive: {less}"
     if is_held(robot, log):
         return "forward", ""
     return "segments", f"open loop, the plain model can be followed for {follow(robot, log, threads):.2g} s"
+
+
+def _swinging(robot: Robot, log: Log, threads: int) -> tuple[str, ...]:
+    """Joints whose measured torque is too little to be compared, where every drive can give what was measured."""
+    if not drives_nothing(log, robot.for_log(log).model):
+        return ()
+    return InverseEpisode.whole(robot, log, threads).swinging(threads)
 
 
 def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:

@@ -169,7 +169,8 @@ def _instead_of_commands(log: Log, torques_alone: bool) -> Iterator[Problem]:
             "command.none",
             "note",
             "command.*",
-            "no command is logged: the measured torques are compared with those that the measured motion takes",
+            "no command is logged: the measured torques are compared with those that the measured motion takes, or, "
+            "where something swings by its weight, drive the model",
             "nothing, if none was recorded; what limits, delays or gains of servos do cannot be found without it",
         )
     currents = [] if log.meta.torque_constant is None else [j for j in log.joints("current") if log.has("effort", j)]
