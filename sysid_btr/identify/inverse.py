@@ -177,8 +177,8 @@ class InverseEpisode(Episode):
 
         The torque is then a small difference of inertia and weight. Errors of the accelerations are not small beside
         it, and regression shrinks every number (Janot, Vandanjon and Gautier 2014, doi:10.1109/TCST.2013.2246163). On
-        industrial arms that follow a path it is 2 to 60 times the inertia's, in seven of eight logs of a double pendulum
-        that swings 0.02 to 0.6 of it.
+        industrial arms that follow a path it is 2 to 60 times the inertia's, in seven of eight logs of a double
+        pendulum that swings 0.02 to 0.6 of it.
         """
         replay = self.replay((), Numerics("RK4", self.kinematics.period), threads=threads)
         steady = replace(self.kinematics, acceleration=0 * self.kinematics.acceleration)
