@@ -27,6 +27,7 @@ from sysid_btr.terms.free_form import (
     FreeCurve,
     FreeFrictionSpeed,
     FreeGainOfAll,
+    FreeGainStiffness,
     FreeGainTime,
     FreeReadingPosition,
     FreeReadingTime,
@@ -141,6 +142,25 @@ def test_a_gain_that_falls_evenly_is_a_supply_that_sags(cls: type[FreeCurve], pl
     sagging, plain = moved(VoltageSag.at(("robot",), STUDY.scales), [rate])[within], moved(term, term.neutral)[within]
     falling = Replay(weaker, LOG, (term,), STUDY.numerics).predict(amounts[None]).position[0, :, 0][within]
     assert np.abs(falling - sagging).max() < 0.01 * np.abs(plain - sagging).max()
+
+
+def test_where_stiffness_falls_the_damping_stays() -> None:
+    """As in a servo without damping at a joint that has all of it."""
+    bare = robot_from_xml(XML.replace('damping=".1"', 'damping=".6"').replace('kv=".5"', 'kv="0"'))
+    stiffness, gain = (cls.at(("robot",), STUDY.scales) for cls in (FreeGainStiffness, FreeGainOfAll))
+    amounts = fitted(stiffness, np.linspace(0, 2, 50), np.linspace(0.3, -0.3, 50))
+    replays = [
+        (bare, gain, amounts),
+        (ROBOT, gain, amounts),
+        (ROBOT, stiffness, amounts),
+        (ROBOT, stiffness, 0 * amounts),
+    ]
+    wanted, whole, falling, plain = (
+        Replay(robot, LOG, (term,), Numerics("RK4", 0.0005)).predict(values[None]).position[0, :, 0]
+        for robot, term, values in replays
+    )
+    assert np.abs(falling - wanted).max() < 0.01 * np.abs(whole - wanted).max()
+    assert np.abs(falling - wanted).max() < 0.01 * np.abs(plain - wanted).max()
 
 
 def test_a_gain_never_changes_its_sign() -> None:

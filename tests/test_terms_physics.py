@@ -52,7 +52,7 @@ from sysid_btr.terms.friction import (
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
-from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
+from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad, VoltageSagLoadStiffness
 from sysid_btr.terms.sensing import (
     EncoderCyclicError,
     EncoderOffset,
@@ -516,12 +516,13 @@ def test_a_sagging_supply_weakens_the_servo_with_time() -> None:
     assert at_end < rest(VoltageSag, [0.0], seconds=6.0) - 0.01
 
 
-def test_a_soft_supply_weakens_the_servo_with_its_own_load() -> None:
+@pytest.mark.parametrize("supply", [VoltageSagLoad, VoltageSagLoadStiffness])
+def test_a_soft_supply_weakens_the_servo_with_its_own_load(supply: type[Effect]) -> None:
     def balance(q: float) -> float:
         asked, flowing = KP * (COMMAND - q), gravity(q)
         return asked * (1 - 0.3 * abs(flowing)) - flowing
 
-    q = rest(VoltageSagLoad, [0.3])
+    q = rest(supply, [0.3])
     assert balance(q) == pytest.approx(0, abs=1e-8)
 
 

@@ -22,7 +22,7 @@ from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.simulator import States
 from sysid_btr.terms.law import ROWS, Step
 
-COMMAND, QPOS, QVEL, TORQUE, LOAD, VOLTAGE, ENABLED, GAIN, MOTOR, JOINT, FRICTION, LOW, HIGH = range(ROWS)
+COMMAND, QPOS, QVEL, TORQUE, PROPORTIONAL, LOAD, VOLTAGE, ENABLED, GAIN, MOTOR, JOINT, FRICTION, LOW, HIGH = range(ROWS)
 """Rows of a step's arrays, in the order of `Step`."""
 
 
@@ -214,6 +214,7 @@ def _apply(laws: Laws, numbers: Any, awake: Any, memory: Any, time: float, times
         rows[QPOS],
         rows[QVEL],
         rows[TORQUE],
+        rows[PROPORTIONAL],
         rows[LOAD],
         rows[VOLTAGE],
         rows[ENABLED],
@@ -246,6 +247,18 @@ def _torque(i: int, plan: Plan, own: Candidates, command: Any, q: Any, v: Any, t
 
 
 torque_of = compiled(_torque)
+
+
+def _proportional(i: int, plan: Plan, own: Candidates, step: Any) -> None:
+    """Write the part of the servos' torques that position servos give by their stiffness."""
+    for d in range(len(plan.driven)):
+        j = plan.driven[d]
+        if own.stiffness[i, d] != 0.0:
+            total = own.gain[i, d] * min(max(step[COMMAND, j], own.least[i, d]), own.most[i, d])
+            step[PROPORTIONAL, j] = (total + own.stiffness[i, d] * step[QPOS, j]) * own.gear[i, d]
+
+
+write_proportional = compiled(_proportional)
 
 
 def _given(i: int, plan: Plan, own: Candidates, memory: Memory, torque: Any) -> None:
@@ -300,6 +313,7 @@ def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Me
             step[ENABLED] = own.enabled[i, k]
         torque_of(i, plan, own, step[COMMAND], step[QPOS], step[QVEL], step[TORQUE])
         step[TORQUE] = np.minimum(np.maximum(step[TORQUE], step[LOW]), step[HIGH])
+        write_proportional(i, plan, own, step)
         apply_laws(plan.laws, own.numbers[i], own.awake[i], memory.laws, own.began[i] + (k * h + 0.5 * h), h, step)
         if plan.friction:
             for j in range(len(q)):

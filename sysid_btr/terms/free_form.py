@@ -558,6 +558,25 @@ class FreeGainOfAll(FreeGainTime):
             step.gain[j] *= gain
 
 
+@dataclass(frozen=True)
+class FreeGainStiffness(FreeGainOfAll):
+    """A change of the stiffness of all servos together, and not of their damping, that is a smooth function of time.
+
+    Law: stiffness = 1 + the curve at each step, and never below 0.
+    """
+
+    variant: ClassVar[str] = "stiffness"
+    label: ClassVar[str] = "free_gain.stiffness"
+    title: ClassVar[str] = "change of all servos' stiffness that follows time"
+    includes: ClassVar[tuple[str, ...]] = ()
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        change = gain_at(step.time, numbers[0]) - 1
+        for j in places:
+            step.motor_torque[j] += change * step.gain[j] * step.proportional[j]
+
+
 def _near_frequency(
     parameters: Sequence[Parameter], values: FloatArray, kinds: int, seconds: float
 ) -> tuple[Parameter, ...]:

@@ -26,6 +26,7 @@ class Step(NamedTuple):
     qpos, qvel : of the motor side, extrapolated to the middle of the step, which makes a law that is held over the step
         second-order accurate.
     torque : of the plain servo there.
+    proportional : the part of it that a position servo's stiffness gives.
     load : torque by which gravity and the motion of the links load the joint, as of the last step.
     voltage, enabled : measured inputs of the drive; a voltage that is not logged is not a number, and a drive without
         flags is enabled.
@@ -39,6 +40,7 @@ class Step(NamedTuple):
     qpos: FloatArray
     qvel: FloatArray
     torque: FloatArray
+    proportional: FloatArray
     load: FloatArray
     voltage: FloatArray
     enabled: FloatArray

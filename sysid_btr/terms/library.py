@@ -17,7 +17,7 @@ from sysid_btr.terms.disturbance import (
     ExternalDisturbanceTrain,
 )
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.free_form import FREE_FORMS, FreeGainOfAll
+from sysid_btr.terms.free_form import FREE_FORMS, FreeGainOfAll, FreeGainStiffness
 from sysid_btr.terms.friction import (
     CoulombFriction,
     LoadFriction,
@@ -31,7 +31,7 @@ from sysid_btr.terms.friction import (
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Inertia, Mass, Payload
 from sysid_btr.terms.initial_state import StartPosition, StartVelocity
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
-from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad
+from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad, VoltageSagLoadStiffness
 from sysid_btr.terms.sensing import (
     EncoderCyclicError,
     EncoderOffset,
@@ -100,7 +100,9 @@ BUILT_IN: tuple[type[Term], ...] = (
     IntegralGain,
     VoltageSag,
     VoltageSagLoad,
+    VoltageSagLoadStiffness,
     FreeGainOfAll,
+    FreeGainStiffness,
     ThermalDerating,
     Payload,
     ComOffset,

@@ -71,6 +71,23 @@ class VoltageSagLoad(VoltageSag):
 
 
 @dataclass(frozen=True)
+class VoltageSagLoadStiffness(VoltageSagLoad):
+    """Law: stiffness = 1 - ratio * sum of all servo torques, and damping stays: a firmware limits its P term."""
+
+    title: ClassVar[str] = "loss of stiffness per unit of total torque"
+    variant: ClassVar[str] = "load_stiffness"
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        total = 0.0
+        for j in places:
+            total += abs(step.torque[j])
+        lost = 1 - 1 / (1 + numbers[0, 0] * total)
+        for j in places:
+            step.motor_torque[j] -= lost * step.gain[j] * step.proportional[j]
+
+
+@dataclass(frozen=True)
 class Switch(Term):
     """A drive that gives no torque while the log says that it is off; no effect, and without parameters.
 
