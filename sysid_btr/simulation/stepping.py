@@ -236,12 +236,20 @@ def _apply(laws: Laws, numbers: Any, awake: Any, memory: Any, time: float, times
 apply_laws = compiled(_apply)
 
 
+def _commanded(i: int, d: int, own: Candidates, command: float) -> float:
+    """What a servo makes of its command, within its range."""
+    return float(own.gain[i, d] * min(max(command, own.least[i, d]), own.most[i, d]))
+
+
+commanded_of = compiled(_commanded)
+
+
 def _torque(i: int, plan: Plan, own: Candidates, command: Any, q: Any, v: Any, torque: Any) -> None:
     """Torques (j,) that the servos would like to give."""
     torque[:] = 0.0
     for d in range(len(plan.driven)):
         j = plan.driven[d]
-        total = own.gain[i, d] * min(max(command[j], own.least[i, d]), own.most[i, d]) + own.constant[i, d]
+        total = commanded_of(i, d, own, command[j]) + own.constant[i, d]
         total = total + own.stiffness[i, d] * q[j] + own.damping[i, d] * v[j]
         torque[j] = total * own.gear[i, d]
 
@@ -254,7 +262,7 @@ def _proportional(i: int, plan: Plan, own: Candidates, step: Any) -> None:
     for d in range(len(plan.driven)):
         j = plan.driven[d]
         if own.stiffness[i, d] != 0.0:
-            total = own.gain[i, d] * min(max(step[COMMAND, j], own.least[i, d]), own.most[i, d])
+            total = commanded_of(i, d, own, step[COMMAND, j])
             step[PROPORTIONAL, j] = (total + own.stiffness[i, d] * step[QPOS, j]) * own.gear[i, d]
 
 

@@ -51,6 +51,11 @@ class Parameter:
     stated: bool = False
     spread: float = np.inf
 
+    def near(self, value: float, reach: float) -> Parameter:
+        """The same with bounds that are no further than `reach` from a value, and the nominal value within them."""
+        low, high = max(value - reach, self.lower), min(value + reach, self.upper)
+        return replace(self, nominal=min(max(self.nominal, low), high), lower=low, upper=high)
+
 
 @dataclass(frozen=True)
 class Kind:

@@ -221,9 +221,5 @@ def _near(parameters: tuple[Parameter, ...], values: FloatArray, kinds: int) -> 
         duration = float(values[place * kinds + 2])
         value = float(values[i])
         reach = (None, max(0.5 * duration, 0.05), 0.7 * duration, min(0.02 * value, 0.25 * duration))[kind]
-        if reach is not None:
-            low, high = max(value - reach, parameter.lower), min(value + reach, parameter.upper)
-            nominal = min(max(parameter.nominal, low), high)
-            parameter = replace(parameter, nominal=nominal, lower=low, upper=high)
-        result.append(parameter)
+        result.append(parameter if reach is None else parameter.near(value, reach))
     return tuple(result)

@@ -8,8 +8,17 @@ from typing import ClassVar
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import Kind, Term
 from sysid_btr.terms.effect import Effect, Probe
-from sysid_btr.terms.law import Step
+from sysid_btr.terms.law import Step, used_in_laws
 from sysid_btr.terms.scales import JointScale
+
+
+@used_in_laws
+def total_torque(step: Step, places: IntArray) -> float:
+    """Sum of the servos' torques, whichever their signs: what they take from their supply."""
+    total = 0.0
+    for j in places:
+        total += abs(step.torque[j])
+    return total
 
 
 @dataclass(frozen=True)
@@ -63,9 +72,7 @@ class VoltageSagLoad(VoltageSag):
 
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
-        total = 0.0
-        for j in places:
-            total += abs(step.torque[j])
+        total = total_torque(step, places)
         for j in places:
             step.gain[j] /= 1 + numbers[0, 0] * total
 
@@ -79,10 +86,7 @@ class VoltageSagLoadStiffness(VoltageSagLoad):
 
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
-        total = 0.0
-        for j in places:
-            total += abs(step.torque[j])
-        lost = 1 - 1 / (1 + numbers[0, 0] * total)
+        lost = 1 - 1 / (1 + numbers[0, 0] * total_torque(step, places))
         for j in places:
             step.motor_torque[j] -= lost * step.gain[j] * step.proportional[j]
 

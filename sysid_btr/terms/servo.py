@@ -282,13 +282,8 @@ class CommandDelaySampled(Effect):
     def around(self, values: FloatArray) -> Self:
         """The same with times bounded near a guess (parameters,): elsewhere the moments are those of other commands."""
         reach = np.outer(values[:: len(self.kinds)], (0.02, 0.25)).ravel()
-        known = []
-        for parameter, value, most in zip(self.parameters, values, reach, strict=True):
-            low, high = max(value - most, parameter.lower), min(value + most, parameter.upper)
-            known.append(
-                replace(parameter, nominal=float(np.clip(parameter.nominal, low, high)), lower=low, upper=high)
-            )
-        return replace(self, known=tuple(known))
+        near = (p.near(float(v), float(r)) for p, v, r in zip(self.parameters, values, reach, strict=True))
+        return replace(self, known=tuple(near))
 
     def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
         shaped = np.array(np.broadcast_to(command, (len(values), *command.shape[1:])))
