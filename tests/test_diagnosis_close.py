@@ -37,7 +37,13 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FreeTorquePeriodic
-from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, StribeckFriction, ViscousDamping
+from sysid_btr.terms.friction import (
+    CoulombFriction,
+    PreslidingFriction,
+    QuadraticDamping,
+    StribeckFriction,
+    ViscousDamping,
+)
 from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Payload
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
 from sysid_btr.terms.model import Model
@@ -302,6 +308,7 @@ def diagnose(plant: Plant | None) -> Closing:
 KNEE = ("knee",)
 PLANTS = [
     Plant(CoulombFriction(KNEE), (0.15,)),
+    Plant(PreslidingFriction(KNEE), (0.2, 0.03)),
     Plant(ViscousDamping(KNEE), (0.15,), effort=True),
     Plant(QuadraticDamping(KNEE), (0.06,)),
     Plant(Armature(KNEE), (0.01,)),

@@ -67,7 +67,8 @@ def test_effects_are_chosen_by_name_and_a_wrong_name_is_told() -> None:
     assert usual.isdisjoint({"mass", "inertia", "kv", "torque_constant"}), "what the user declares"
     assert "kp" in usual, "a servo that is weaker than the model says"
     named = [(e.name, e.variant) for e in select_effects(["kp", "frictionloss", "delay"])]
-    assert named == [("kp", ""), ("coulomb_friction", ""), ("command_delay", ""), ("command_delay", "sampled")]
+    friction = [("coulomb_friction", ""), ("coulomb_friction", "presliding")]
+    assert named == [("kp", ""), *friction, ("command_delay", ""), ("command_delay", "sampled")]
     assert {e.name for e in select_effects(["backlash", "payload"])} == {"backlash", "payload"}
     with pytest.raises(UsageError, match=r"'backlsh' \(did you mean 'backlash'\?\)$"):
         select_effects(["backlsh"])

@@ -45,6 +45,7 @@ from sysid_btr.terms.friction import (
     LoadFrictionLarger,
     LoadFrictionQuadratic,
     LoadFrictionStribeck,
+    PreslidingFriction,
     QuadraticDamping,
     StribeckFriction,
     ViscousDamping,
@@ -357,6 +358,25 @@ def test_quadratic_damping_decays_a_free_rotor_as_one_over_time() -> None:
         outputs = run(robot, log, [*start, at_arm(QuadraticDamping)], [sign * 2.0, 0.06])
         wanted = sign * 2.0 / (1 + 2.0 * 0.06 / TOTAL_INERTIA * np.arange(201) * 0.01)
         np.testing.assert_allclose(outputs.velocity[0, :, 0], wanted, rtol=1e-6)
+
+
+def test_friction_that_bends_takes_a_springs_energy_first_and_gives_some_of_it_back() -> None:
+    torque, bend, speed = 0.2, 0.05, 1.5
+    robot, log = loose(), make_log(np.arange(201) * 0.01, {})
+    start = parse_parameters(["qvel0:arm"], robot)
+    numerics = Numerics("RK4", 0.001)
+    outputs = run(robot, log, [*start, at_arm(PreslidingFriction)], [speed, torque, bend], numerics)
+    q, v = outputs.position[0, :, 0], outputs.velocity[0, :, 0]
+    forth = slice(0, int(np.argmax(v <= 0)))
+    assert q[forth][-1] > 3 * bend, "far enough to slide"
+    lost = torque * (q - bend * -np.expm1(-q / bend))
+    np.testing.assert_allclose(
+        0.5 * TOTAL_INERTIA * v[forth] ** 2, 0.5 * TOTAL_INERTIA * speed**2 - lost[forth], atol=1e-4
+    )
+    assert q.max() - q[-1] > 0.1 * bend, "bristles push back"
+    sharp = run(robot, log, [*start, at_arm(PreslidingFriction)], [speed, torque, 0.002], numerics)
+    dry = run(robot, log, [*start, at_arm(CoulombFriction)], [speed, torque], numerics)
+    np.testing.assert_allclose(sharp.position, dry.position, atol=0.004)
 
 
 def test_stribeck_friction_without_its_static_part_is_dry_friction() -> None:

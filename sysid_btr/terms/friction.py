@@ -181,6 +181,53 @@ class StribeckFriction(Effect):
 
 
 @dataclass(frozen=True)
+class PreslidingFriction(Effect):
+    """Dry friction that bends before it slides: grease, seals, teeth that give (Dahl 1968, doi:10.21236/ADA041920).
+
+    Law: torque = -torque z / deflection, z' = v - |v| z / deflection from z = 0; exact for the velocity of a step.
+    """
+
+    name: ClassVar[str] = "coulomb_friction"
+    family: ClassVar[str] = "friction"
+    variant: ClassVar[str] = "presliding"
+    label: ClassVar[str] = "coulomb_friction.presliding"
+    title: ClassVar[str] = "pre-sliding friction"
+    law_memory: ClassVar[int] = 1
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.05),
+        Kind("deflection", "rad", 0.01, 0.001, 0.3, 0.005),
+    )
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
+    held: ClassVar[tuple[str, ...]] = ("deflection",)
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("coulomb_friction", "small motions about a reversal"),
+        ("backlash", "reversals under a load that does not change sign"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        deflection = 0.02 * max(scale.span, 1e-9)
+        return (
+            Kind("torque", "Nm", 0.0, 0.0, scale.counter_peak, 0.15 * scale.torque_rms),
+            Kind("deflection", "rad", deflection, 0.1 * deflection, 10 * deflection, 0.5 * deflection),
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        size, deflection = cls.sized(scale)
+        return tuple(((a * size.scale, f * deflection.nominal),) for a in (1.0, 4.0) for f in (0.3, 1.0, 3.0))
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            deflection, speed = numbers[p, 1], abs(step.qvel[j])
+            slid = math.copysign(deflection, step.qvel[j])  # where bristles go at this velocity
+            middle = slid + (memory[p, 0] - slid) * math.exp(-0.5 * speed * step.timestep / deflection)
+            step.joint_torque[j] -= numbers[p, 0] * middle / deflection
+            memory[p, 0] = slid + (memory[p, 0] - slid) * math.exp(-speed * step.timestep / deflection)
+
+
+@dataclass(frozen=True)
 class LoadFriction(Effect):
     """Load-dependent friction: teeth and bearings rub the more, the more they carry (BAM, arXiv:2410.08650).
 
