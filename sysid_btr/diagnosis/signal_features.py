@@ -24,7 +24,7 @@ FASTEST, SLOWEST = 0.01, 0.2
 """Seconds between commands that a drive takes: hobby servos to slow buses. What is faster is a delay."""
 GLANCE = 8.0
 """Seconds of a log in which these are sought first."""
-STARTS, MOST_PEAKS, NEAR, REFINEMENTS = 8, 6, 7, 3
+STARTS, MOST_PEAKS, NEAR, REFINEMENTS = 12, 12, 7, 3
 """Parts of a period in which the first command may be taken; periods that are refined, from how many, how often."""
 SHORTER = 0.8
 """A shorter period is preferred if it explains at least this fraction of what the best one does."""
