@@ -54,7 +54,14 @@ from sysid_btr.terms.servo import (
     TorqueConstant,
 )
 from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow
-from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
+from sysid_btr.terms.transmission import (
+    Backlash,
+    BacklashGreased,
+    BacklashMotor,
+    Cogging,
+    JointCompliance,
+    JointComplianceMotor,
+)
 
 ENTRY_POINTS = "sysid_btr.terms"
 """Entry-point group; each entry is a class of terms, under its name."""
@@ -84,6 +91,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     DriveCouplingDifference,
     Backlash,
     BacklashMotor,
+    BacklashGreased,
     JointCompliance,
     JointComplianceMotor,
     JointSpring,

@@ -105,6 +105,38 @@ class BacklashMotor(Backlash):
     variant: ClassVar[str] = "motor"
 
 
+@dataclass(frozen=True)
+class BacklashGreased(Backlash):
+    """Grease fills the play: the link drags along while it crosses, so that the way back is not the way out.
+
+    Structure: as without, and native `dof_damping` of the second joint; the joint's own damping stays on the motor, as
+    grease damps the link.
+    """
+
+    variant: ClassVar[str] = "greased"
+    title: ClassVar[str] = "greased play in the gear"
+    kinds: ClassVar[tuple[Kind, ...]] = (*Backlash.kinds, Kind("grease", "Nm s/rad", 0.0, 0.0, 10.0, 0.1))
+    held: ClassVar[tuple[str, ...]] = ("softness", "grease")
+    details: ClassVar[tuple[str, ...]] = ("softness",)
+    includes: ClassVar[tuple[str, ...]] = ("backlash",)
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        grease = 0.3 * scale.damping
+        return (*super().sized(scale), Kind("grease", "Nm s/rad", 0.0, 0.0, 20 * grease, 0.5 * grease))
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        grease = 0.3 * scale.damping
+        return tuple(((*p, f * grease),) for (p,) in super().probes(scale) for f in (0.3, 1.0, 3.0))
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        links = [batch.model.joint(name + LINK_SUFFIX).id for name in self.places]
+        damping = batch.read("dof_damping")
+        damping[:, batch.model.jnt_dofadr[links]] += values[:, :, 2]
+        return {**super().model_fields(batch, values), "dof_damping": damping}
+
+
 def add_link_joint(spec: mujoco.MjSpec, name: str, *, damping_on_link: bool) -> None:
     """Split a joint into a motor side (the joint itself) and a link side (a second one, same axis).
 
