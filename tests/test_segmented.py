@@ -30,11 +30,20 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbanceTrain
-from sysid_btr.terms.free_form import FreeGainTime, FreeTorquePeriodic
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.free_form import FreeGainTime, FreeReadingPosition, FreeReadingTime, FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, ViscousDamping
 from sysid_btr.terms.inertial import Armature, Payload
 from sysid_btr.terms.model import Model
-from sysid_btr.terms.sensing import TorqueScale
+from sysid_btr.terms.sensing import (
+    EncoderCyclicError,
+    EncoderOffset,
+    EncoderOffsetInLoop,
+    EncoderScale,
+    EncoderScaleInLoop,
+    SensorDelay,
+    TorqueScale,
+)
 from sysid_btr.terms.servo import CommandDelay
 from sysid_btr.terms.spring import JointSpring
 
@@ -287,6 +296,38 @@ def test_segments_from_the_states_of_a_whole_replay_give_that_replay(jitter: flo
         assert np.array_equal(alone.position[0, 220:321], segments.position[k, 220:321])
 
 
+READERS = {
+    EncoderOffset: (0.04,),
+    EncoderOffsetInLoop: (-0.04,),
+    EncoderScale: (0.1,),
+    EncoderScaleInLoop: (-0.05,),
+    EncoderCyclicError: (0.02, -0.01, 5.0),
+    SensorDelay: (0.012,),
+    FreeReadingTime: (0.03, 0.02, 0.01),
+    FreeReadingPosition: (0.02, 0.02, 0.01),
+}
+
+
+@pytest.mark.parametrize("effect", READERS)
+def test_a_segment_starts_where_the_joint_is_and_not_where_its_sensor_says(effect: type[Effect]) -> None:
+    """... and a sensor's error keeps the log's time: segments show what the whole replay shows."""
+    robot, log = double_pendulum(dry='damping=".05"'), driven(seconds=2.0, torque=QUIET)
+    term = effect.at(("shoulder",), dict.fromkeys(JOINTS, replace(SCALE, seconds=2.0)))
+    values = term.neutral.copy()
+    values[: len(READERS[effect])] = READERS[effect]
+    numerics = Numerics("RK4", 0.0025)
+    whole = Replay(robot, log, (term,), numerics).predict(values[None])
+    rows = np.array([[120, 220], [220, 321], [321, 399]])
+    first, shown = rows[:, 0], whole.position[0]
+    velocity = np.gradient(shown, log.time, axis=0)
+    rate = np.gradient(velocity, log.time, axis=0)
+    starts = Segments(rows, shown[first], velocity[first], np.ones((3, 4)), None, rate[first])
+    segments = SegmentReplay(robot, log, (term,), numerics, segments=starts).predict(values[None])
+    np.testing.assert_allclose(segments.position[0, 120:399], shown[120:399], atol=2e-3)
+    plain = Replay(robot, log, (), numerics).predict(np.zeros((1, 0)))
+    assert np.abs(plain.position - whole.position)[0, 120:399].max() > 5e-3, "an error that shows"
+
+
 def test_the_right_model_leaves_noise_alone_however_long_a_robot_remembers_its_start() -> None:
     """Damped arms can be followed to the end of the log, and what is unknown of a start lasts for seconds."""
     damped = 'damping=".02"'
@@ -406,6 +447,23 @@ def test_intervals_over_segments_hold_the_truth_although_an_effect_is_missing() 
             narrow.append(abs(one.value - truth) <= 2.0 * (one.std_if_right or one.std))
     assert np.mean(wide) >= 0.9
     assert np.mean(narrow) < np.mean(wide)
+
+
+def test_an_encoder_that_drifts_is_named_where_motors_drive() -> None:
+    robot, rng = double_pendulum('damping=".02"'), np.random.default_rng(5)
+    log = driven(3, torque=QUIET, seconds=8.0, dry='damping=".02"', upper=0.5)
+    moved = np.column_stack([log.channels[f"position.{j}"] for j in JOINTS])
+    moved[:, 0] += 0.05 * -np.expm1(-log.time / 4.0)
+    shown = {
+        f"position.{j}": x for j, x in zip(JOINTS, (moved + rng.normal(scale=NOISE, size=moved.shape)).T, strict=True)
+    }
+    found = close(make_study(robot, [replace(log, channels={**log.channels, **shown})], threads=1), ["mass:*"])
+    (effect,) = found.effects
+    assert (effect.effect, effect.variant, effect.where) == ("free_reading", "time", ("shoulder",))
+    assert effect.certainty > 0.5
+    assert found.after.train["position"].chi2 < 1.2
+    for estimate in found.parameters[:2]:
+        assert abs(estimate.value - 1.0) < 4 * estimate.std + 0.01
 
 
 def test_a_wave_from_outside_is_named_where_motors_drive_and_nothing_where_there_is_none() -> None:

@@ -18,6 +18,8 @@ from sysid_btr.diagnosis.signal_features import FOLDS, line_shares, memory
 from sysid_btr.identify.intervals import NORMAL
 from sysid_btr.identify.missing_torque import MissingTorque
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.simulation.segments import SegmentReplay
+from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.drives import DriveKind
 from sysid_btr.terms.free_form import (
     FREE_FORMS,
@@ -37,6 +39,7 @@ from sysid_btr.terms.free_form import (
     FreeTorqueTime,
     FreeTorqueVelocity,
 )
+from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import JointScale, Scales, scale_at
 
 LOUD = 1.3
@@ -128,7 +131,9 @@ def free_forms(
             form
             for effect in FREE_FORMS
             if (effect, joint) not in known and _can_be_at(effect, drives.get(joint))
-            for form in _forms(effect, [_evidence(effect, m, problem) for m in own], scale_at(scales, joint))
+            for form in _forms(
+                effect, [_evidence(effect, m, problem, values, scales) for m in own], scale_at(scales, joint)
+            )
             if form.share >= WEAK
         ]
         if found:
@@ -146,19 +151,51 @@ def _can_be_at(effect: type[FreeCurve], drive: DriveKind | None) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What a form is to explain of one estimate: (n,) torques, or errors of position, and their noise."""
+    """What a form is to explain of one estimate.
+
+    Attributes
+    ----------
+    one : the estimate.
+    values, noise : (n,) torques, or errors of position, and their noise.
+    columns : what the form's modes do to them, (n, modes), at a frequency where it has one.
+    """
 
     one: MissingTorque
     values: FloatArray
     noise: float
+    columns: Callable[..., FloatArray]
 
 
-def _evidence(effect: type[FreeCurve], one: MissingTorque, problem: ReplayProblem) -> _Evidence:
+def _evidence(
+    effect: type[FreeCurve], one: MissingTorque, problem: ReplayProblem, values: FloatArray, scales: Scales
+) -> _Evidence:
+    ends = effect.range_of(scale_at(scales, one.joint))
     if not issubclass(effect, FreeReading):
-        return _Evidence(one, one.torque, one.noise)
-    targets = (t for t in problem.episodes[one.episode].targets if one.joint in t.joints)
+        return _Evidence(one, one.torque, one.noise, lambda *more: one.seen(design(effect, one, ends, *more)))
+    episode = problem.episodes[one.episode]
+    targets = (t for t in episode.targets if one.joint in t.joints)
     noise = next((float(t.noise[t.joints.index(one.joint)]) for t in targets if t.channel == "position"), 0.0)
-    return _Evidence(one, one.residual * noise, noise)
+    # a segment starts from what the sensor shows, and goes where that leads
+    started = isinstance(episode.replay, SegmentReplay)
+    columns = _replayed_modes(effect, one, problem, values, scales) if started else design(effect, one, ends)
+    return _Evidence(one, one.residual * noise, noise, lambda: columns)
+
+
+def _replayed_modes(
+    effect: type[FreeCurve], one: MissingTorque, problem: ReplayProblem, values: FloatArray, scales: Scales
+) -> FloatArray:
+    """(n, modes) change of the position that a joint's sensor shows with each mode, by replays."""
+    term = effect.at((one.joint,), scales)
+    model = Model(problem.terms, values).with_(term, term.neutral)
+    size = np.array([kind.scale for kind in term.numbers])
+    changed = np.vstack([np.zeros(len(size)), np.diag(size)])
+    candidates = np.hstack([np.tile(values, (len(changed), 1)), changed])
+    replay = problem.with_model(model).episodes[one.episode].replay
+    with silenced():
+        outputs = replay.predict(candidates)
+    position = np.nan_to_num(outputs.position[:, :, replay.index.joints.index(one.joint)])
+    change = (position[1:] - position[0]) / size[:, None]
+    return np.column_stack([np.interp(one.time, outputs.time, row) for row in change])
 
 
 def _forms(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale) -> Iterator[FreeForm]:
@@ -182,8 +219,7 @@ def _form(effect: type[FreeCurve], own: Sequence[_Evidence], scale: JointScale, 
     seen, torque = [], []
     for each in own:
         rows = slice(None, None, -(-len(each.values) // MOST))
-        columns = design(effect, each.one, ends, *more)
-        seen.append((columns if issubclass(effect, FreeReading) else each.one.seen(columns))[rows])
+        seen.append(each.columns(*more)[rows])
         torque.append(each.values[rows])
     block = SHORT_STRETCH if effect in OF_TIME else STRETCH
     curve = _penalised(np.concatenate(torque), np.concatenate(seen), relative)

@@ -15,6 +15,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import write_terms
 from sysid_btr.simulation.silence import silenced
+from sysid_btr.simulation.start import behind_sensors
 from sysid_btr.terms.base import BatchModel, Outputs
 
 if TYPE_CHECKING:
@@ -75,7 +76,9 @@ def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ..
     pairs = [(term, np.tile(values, (logs, 1, 1))) for term, values in values_of]
     write_terms(batch, pairs)
     steps = max(grid.steps for grid in grids)
-    qpos, qvel = (np.repeat(np.stack([r.start[i] for r in replays]), m, axis=0) for i in (0, 1))
+    starts = (np.repeat(np.stack([r.start[i] for r in replays]), m, axis=0) for i in (0, 1))
+    shown = np.repeat(np.stack([r.shown for r in replays]), m, axis=0)
+    qpos, qvel = behind_sensors(batch, pairs, shown, *starts)
     last = np.minimum(np.arange(steps), np.array([[g.steps - 1] for g in grids]))
     command, extra = (
         np.repeat(np.stack([rows[k] for rows, k in zip(of_logs, last, strict=True)]), m, axis=0)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.memory import memory_limit, require_memory
 from sysid_btr.models.commands import commanded
 from sysid_btr.models.pose import resting
@@ -26,7 +26,7 @@ from sysid_btr.simulation.servo import ServoLaw
 from sysid_btr.simulation.setup import Setup, Values, prepare, write_terms
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.simulation.simulator import States
-from sysid_btr.simulation.start import Start, coupled_state, initial_state
+from sysid_btr.simulation.start import Start, behind_sensors, coupled_state, initial_state
 from sysid_btr.terms.base import BatchModel, JointAddresses, Outputs, Parameter, Term
 from sysid_btr.terms.drives import joint_drives
 from sysid_btr.terms.power import Switch
@@ -107,8 +107,12 @@ class Replay:
             start = initial_state(self.log, joints, resting(self.robot, self.log, joints))
         else:
             start = self.begun.position.copy(), self.begun.velocity.copy()
-        unlogged = np.array([not self.log.has("position", joint) for joint in joints], dtype=bool)
-        return coupled_state(self.model, self.index, *start, unlogged)
+        return coupled_state(self.model, self.index, *start, ~self.shown)
+
+    @cached_property
+    def shown(self) -> BoolArray:
+        """(j,) which joints have their position in the log."""
+        return np.array([self.log.has("position", joint) for joint in self.index.joints], dtype=bool)
 
     @cached_property
     def idle(self) -> tuple[FloatArray, dict[str, float]]:
@@ -192,9 +196,10 @@ class Replay:
 
     def _run(self, candidates: FloatArray) -> Outputs:
         pairs, m, grid = self._values(candidates), len(candidates), self.grid
-        qpos, qvel = (np.tile(start, (m, 1)) for start in self.start)
         command, extra = (np.broadcast_to(x, (m, *x.shape)) for x in (grid.command, grid.extra))
-        setup = self._prepare(self.batch(pairs, m), pairs, qpos, qvel, command, ((self.log, grid),), extra)
+        batch = self.batch(pairs, m)
+        qpos, qvel = behind_sensors(batch, pairs, self.shown, *(np.tile(start, (m, 1)) for start in self.start))
+        setup = self._prepare(batch, pairs, qpos, qvel, command, ((self.log, grid),), extra)
         return self._go(setup, pairs, grid)
 
     def batch(self, pairs: Values, size: int) -> BatchModel:
@@ -243,7 +248,8 @@ class Replay:
             steps = np.minimum(grid.state[grid.before], grid.steps - 1)
             effort = ServoLaw.of(setup.batch, rows).torque(setup.command[rows][:, steps], motor, motor_velocity)
         base = None if states.base is None else states.base[:, grid.before]
-        outputs = Outputs(grid.sample_time, position, velocity, effort, base)
+        began = np.broadcast_to(setup.began, setup.size)[rows]
+        outputs = Outputs(grid.sample_time, position, velocity, effort, base, began)
         for term, values in pairs:
             term.read_out(setup.batch, values, outputs)
         bad = ~np.isfinite(outputs.position).all(axis=(1, 2)) | states.failed

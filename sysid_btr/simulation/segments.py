@@ -20,6 +20,7 @@ from sysid_btr.mujoco_conventions import free_joints, to_quaternion, to_rotation
 from sysid_btr.simulation.grid import Grid, step_inputs
 from sysid_btr.simulation.replay import CHUNK_DOFS, Replay
 from sysid_btr.simulation.setup import Setup, Values, prepare
+from sysid_btr.simulation.start import behind_sensors
 from sysid_btr.simulation.subtrees import subtrees
 from sysid_btr.terms.base import Fields, Outputs
 
@@ -375,13 +376,15 @@ class SegmentReplay(Replay):
         if late.any():
             starts = starts.late(late)
         batch = self.batch(pairs, len(segment))
+        course = starts.joint_position, starts.joint_velocity, starts.joint_acceleration
+        qpos, qvel = behind_sensors(batch, pairs, self.shown, *course, h * first)
         lead = round(self.lead / h)
         rows = np.clip(first[:, None] + np.arange(-lead, steps), 0, self.grid.steps - 1)
         setup = prepare(
             batch,
             pairs,
-            starts.joint_position.copy(),
-            starts.joint_velocity.copy(),
+            qpos,
+            qvel,
             self.grid.command[rows],
             self.numerics,
             inputs=lambda: {n: values[rows[:, lead:].T] for n, values in step_inputs(self.log, self.grid).items()},

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.terms.base import Outputs
 
 if TYPE_CHECKING:
     import mujoco
 
     from sysid_btr.io.log import Log
-    from sysid_btr.terms.base import JointAddresses
+    from sysid_btr.simulation.setup import Values
+    from sysid_btr.terms.base import BatchModel, JointAddresses
 
 FIT_SAMPLES = 7
 """Samples of the polynomial whose value and slope are the start."""
@@ -23,9 +25,15 @@ ROUNDS, CLOSED = 30, 1e-10
 """Iterations that close loops of joints, and the error in m or rad at which they are closed."""
 
 
+COURSE = np.array([-1.0, -0.001, 0.0, 0.001])
+"""s about a start, at which it is asked what sensors show: those with a delay look back."""
+NUDGE, TIMES, FLATTEST = 1e-4, 4, 0.3
+"""rad, by which the slope of a sensor is found; steps of Newton's method; slope below which none is believed."""
+
+
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A state of the joints of a log, (j,) each."""
+    """A state of the joints of a log, (j,) each, as its sensors show it."""
 
     position: FloatArray
     velocity: FloatArray
@@ -53,6 +61,53 @@ def initial_state(log: Log, joints: tuple[str, ...], defaults: FloatArray) -> tu
         if log.has("velocity", joint) and np.isfinite(log.channels[f"velocity.{joint}"][0]):
             qvel[i] = log.channels[f"velocity.{joint}"][0]
     return qpos, qvel
+
+
+def behind_sensors(
+    batch: BatchModel,
+    pairs: Values,
+    shown: BoolArray,
+    qpos: FloatArray,
+    qvel: FloatArray,
+    acceleration: FloatArray | None = None,
+    began: FloatArray | float = 0.0,
+) -> tuple[FloatArray, FloatArray]:
+    """States which the sensors, with the errors that terms give them, show as these: `Term.read_out` undone.
+
+    Parameters
+    ----------
+    batch, pairs : the candidates, and the terms they differ in.
+    shown : (j,) or (m, j) joints whose sensors are logged; others start where they are.
+    qpos, qvel : (m, j) as the sensors show them.
+    acceleration : (m, j), by which the motion about the start bends.
+    began : s on the clock of the log at the start, (m,) or of all.
+
+    Returns
+    -------
+    tuple
+        Positions and velocities (m, j), arrays of their own.
+    """
+    position, velocity = qpos.copy(), qvel.copy()
+    readers = [(term, values) for term, values in pairs if type(term).overrides("read_out")]
+    if not readers:
+        return position, velocity
+    bend = np.zeros_like(qpos) if acceleration is None else acceleration
+    time = COURSE[:, None]
+
+    def seen(position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        course = position[:, None] + time * velocity[:, None] + 0.5 * time**2 * bend[:, None]
+        outputs = Outputs(COURSE, course, velocity[:, None] + time * bend[:, None], None, began=began)
+        for term, values in readers:
+            term.read_out(batch, values, outputs)
+        _, before, now, after = np.moveaxis(outputs.position, 1, 0)
+        return now, (after - before) / (COURSE[3] - COURSE[1])
+
+    for _ in range(TIMES):
+        now, rate = seen(position)
+        slope = np.maximum((seen(position + NUDGE)[0] - now) / NUDGE, FLATTEST)
+        position -= np.where(shown, (now - qpos) / slope, 0.0)
+        velocity -= np.where(shown, (rate - qvel) / slope, 0.0)
+    return position, velocity
 
 
 def start_error(log: Log, joint: str, noise: float) -> tuple[float, float]:

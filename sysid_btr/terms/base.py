@@ -181,7 +181,8 @@ class Outputs:
     """Predicted sensors at the log's sample times; arrays are (candidates, samples, joints of the log).
 
     `base`, where it is recorded, is (candidates, samples, 13): position, quaternion, velocity, angular velocity of
-    the free base as MuJoCo has them, at the step border before each sample.
+    the free base as MuJoCo has them, at the step border before each sample. `began` is when `time` was 0, s on the
+    clock of the log, of each candidate (m,) or of all.
     """
 
     time: FloatArray
@@ -189,6 +190,7 @@ class Outputs:
     velocity: FloatArray
     effort: FloatArray | None
     base: FloatArray | None = None
+    began: FloatArray | float = 0.0
 
 
 Scope = Literal["body", "joint", "drive", "feedback", "servo", "robot"]

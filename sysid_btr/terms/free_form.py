@@ -770,7 +770,7 @@ class FreeReadingTime(FreeReading):
 
     @staticmethod
     def seen(outputs: Outputs, columns: IntArray) -> FloatArray:
-        return outputs.time[:, None]
+        return (np.reshape(outputs.began, (-1, 1)) + outputs.time)[:, :, None]
 
 
 FREE_FORMS: tuple[type[FreeCurve], ...] = (

@@ -47,7 +47,6 @@ class EncoderOffsetInLoop(EncoderOffset):
     """The servo closes its loop on what the log shows, which is seen through gravity only.
 
     Command: less by b, as an error of q + b is one of the command by -b.
-    Start: the log's first position, less b.
     """
 
     variant: ClassVar[str] = "loop"
@@ -58,9 +57,6 @@ class EncoderOffsetInLoop(EncoderOffset):
         fed = batch.index.driven_by("position")[columns]
         shaped[:, :, columns[fed]] -= values[:, None, fed, 0]
         return shaped
-
-    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
-        qpos[:, batch.index.of(self.places)] -= values[:, :, 0]
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,6 @@ class EncoderScaleInLoop(EncoderScale):
     """The servo closes its loop on what the log shows.
 
     Native: the second and third of `actuator_biasprm`.
-    Start: the log's first position and velocity, over 1 + e.
     """
 
     variant: ClassVar[str] = "loop"
@@ -102,11 +97,6 @@ class EncoderScaleInLoop(EncoderScale):
         bias, driven = batch.read("actuator_biasprm"), ids >= 0
         bias[:, ids[driven], 1:3] *= 1 + values[:, driven, :1]
         return {"actuator_biasprm": bias}
-
-    def initial_state(self, batch: BatchModel, values: FloatArray, qpos: FloatArray, qvel: FloatArray) -> None:
-        columns = batch.index.of(self.places)
-        qpos[:, columns] /= 1 + values[:, :, 0]
-        qvel[:, columns] /= 1 + values[:, :, 0]
 
 
 @dataclass(frozen=True)
@@ -169,7 +159,8 @@ class EncoderCyclicError(Effect):
 class SensorDelay(Effect):
     """Delay between a joint's position and the log of it.
 
-    Sensor: predicted positions and velocities are read earlier, by cubic interpolation.
+    Sensor: predicted positions and velocities are read earlier, by cubic interpolation; before the first one the joint
+    moved as it does then.
     """
 
     name: ClassVar[str] = "sensor_delay"
@@ -193,7 +184,8 @@ class SensorDelay(Effect):
             delay = values[:, place, 0]
             if not delay.any():
                 continue
-            early = np.maximum(time[None, :] - delay[:, None], time[0])
+            early = time[None, :] - delay[:, None]
+            unseen, early = np.minimum(early - time[0], 0.0), np.maximum(early, time[0])
             after = np.clip(np.searchsorted(time, early, side="left"), 1, len(time) - 1)
             span = time[after] - time[after - 1]
             f = (early - time[after - 1]) / span
@@ -203,7 +195,8 @@ class SensorDelay(Effect):
                 return np.take_along_axis(array, at, axis=1)
 
             v0, v1 = take(v, after - 1), take(v, after)
-            outputs.position[:, :, column] = hermite(f, span, take(p, after - 1), take(p, after), v0, v1)
+            seen = hermite(f, span, take(p, after - 1), take(p, after), v0, v1)
+            outputs.position[:, :, column] = seen + unseen * v0
             outputs.velocity[:, :, column] = v0 + f * (v1 - v0)
 
 
