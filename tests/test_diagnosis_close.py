@@ -49,7 +49,7 @@ from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, Tor
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderCyclicError, EncoderOffset, SensorDelay
 from sysid_btr.terms.servo import CommandDelay, CommandDelaySampled, IntegralGain, Kp
-from sysid_btr.terms.spring import JointSpring, JointStop
+from sysid_btr.terms.spring import JointSpring, JointStop, Tether
 from sysid_btr.terms.transmission import Backlash, Cogging, JointCompliance
 from sysid_btr.writeback.write import identified
 
@@ -318,6 +318,7 @@ PLANTS = [
     Plant(JointCompliance(KNEE), (0.03,), rivals=("backlash",)),
     Plant(JointSpring(KNEE), (1.0, 0.3), rivals=("encoder_scale",)),
     Plant(JointStop(KNEE), (3.0, 0.1)),
+    Plant(Tether(("ankle",)), (2.0, 0.5, -2.0, 12.0, 0.5, 0.02, 0.0, -0.02), tested=3),
     Plant(TorqueLimit(KNEE), (1.0,), rivals=("speed_torque_limit",)),
     Plant(TorqueLimitSoft(KNEE), (1.5,)),
     Plant(SpeedTorqueLimit(KNEE), (2.0, 6.0), rivals=("torque_limit",)),

@@ -65,7 +65,7 @@ from sysid_btr.terms.sensing import (
     TorqueScale,
 )
 from sysid_btr.terms.servo import BackEmf, CommandDelay, CommandDelaySampled, IntegralGain, sampled
-from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow
+from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow, Tether
 from sysid_btr.terms.transmission import Backlash, BacklashMotor, Cogging, JointCompliance, JointComplianceMotor
 
 SCALES = {"arm": SCALE}
@@ -225,6 +225,36 @@ def test_springs_add_up_with_the_models_own() -> None:
     q = solve(lambda q: KP * (COMMAND - q) - gravity(q) - 1.5 * q - 2.0 * (q - 0.2))
     seen = position(sprung, held(COMMAND, 4.0), [at_arm(JointSpring)], [2.0, 0.2])[-1, 0]
     assert seen == pytest.approx(q, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("pull", "stiffness", "distance", "point"),
+    [
+        ((2.0, 0.0, 1.0), 8.0, 0.5, (0.03, 0.02)),
+        ((-1.5, 0.4, 0.0), 0.0, 0.3, (0.0, 0.0)),
+        ((0.6, 0.0, 0.0), 40.0, 0.4, (0.0, 0.0)),
+    ],
+)
+def test_a_tether_pulls_a_point_towards_another_and_never_pushes(
+    pull: tuple[float, ...], stiffness: float, distance: float, point: tuple[float, float]
+) -> None:
+    x, z = point[0], point[1] - LENGTH
+    anchor = np.array([x, 0.0, z]) + distance * np.array(pull) / np.linalg.norm(pull)
+
+    def torque(q: float) -> float:
+        held = np.array([x * np.cos(q) + z * np.sin(q), 0.0, z * np.cos(q) - x * np.sin(q)])
+        cord = anchor - held
+        long = float(np.linalg.norm(cord))
+        # one that does not grow is a band so soft that it grows by a thousandth over its length
+        growth = max(stiffness, 1e-3 * float(np.linalg.norm(pull)) / distance)
+        tension = max(float(np.linalg.norm(pull)) + growth * (long - distance), 0.0)
+        return tension * float(held[2] * cord[0] - held[0] * cord[2]) / long
+
+    for command in (-0.6, COMMAND):
+        q = solve(lambda q, command=command: KP * (command - q) - gravity(q) + torque(q))
+        assert rest(Tether, [*pull, stiffness, distance, point[0], 0.0, point[1]], command) == pytest.approx(
+            q, abs=1e-6
+        )
 
 
 @pytest.mark.parametrize(("stop", "way"), [(JointStop, 1.0), (JointStopBelow, -1.0)])

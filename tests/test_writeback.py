@@ -41,7 +41,7 @@ from sysid_btr.terms.limits import TorqueLimit
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.sensing import EncoderOffset, EncoderOffsetInLoop
 from sysid_btr.terms.servo import CommandDelay, IntegralGain, Kp
-from sysid_btr.terms.spring import JointSpring
+from sysid_btr.terms.spring import JointSpring, Tether
 from sysid_btr.terms.transmission import Backlash, JointCompliance
 from sysid_btr.writeback.params import read_params, starts_from
 from sysid_btr.writeback.write import Draft, Identified, describe_model, draft, identified, params_of, save_model
@@ -410,6 +410,7 @@ EXACT: dict[str, tuple[type[Effect], tuple[str, ...], list[float], str]] = {
     "backlash": (Backlash, ("knee",), [0.03, 0.002], 'name="knee__link"'),
     "compliance": (JointCompliance, ("hip",), [0.02], 'name="hip__link"'),
     "spring": (JointSpring, ("knee",), [1.5, 0.3], "stiffness="),
+    "tether": (Tether, ("knee",), [2.0, 0.5, -1.0, 10.0, 0.6, 0.01, 0.0, -0.02], 'springlength="0 '),
     "torque limit": (TorqueLimit, ("ankle",), [0.3], 'forcerange="-0.3 0.3"'),
     "payload": (Payload, ("knee",), [0.2, 0.05, 0.01, -0.1, 2e-4], 'name="payload_knee"'),
     "tilt": (GravityTilt, ("robot",), [0.05, -0.03], 'gravity="'),

@@ -28,7 +28,7 @@ from sysid_btr.io.noise import is_white
 from sysid_btr.models.commands import drives_nothing
 from sysid_btr.progress import phase, shows_progress, watched
 from sysid_btr.terms.base import Term
-from sysid_btr.terms.effect import COMMANDS, GROUND, Effect, family_of
+from sysid_btr.terms.effect import COMMANDS, GROUND, HELD_BASE, Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.library import select_effects
 
@@ -130,7 +130,7 @@ def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[
     for effect in filter(study.shows, effects):
         if given and effect.scope != "joint" and family_of(effect) in OF_DRIVES:
             continue
-        if (effect.needs == GROUND and not floating) or (effect.needs == COMMANDS and not replayed):
+        if effect.needs == (HELD_BASE if floating else GROUND) or (effect.needs == COMMANDS and not replayed):
             continue
         if effect.needs == "effort" and not any(episode.logged(("effort",)) for episode in study.train):
             continue

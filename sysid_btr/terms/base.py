@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 LINK_SUFFIX = "__link"
 """Name ending of what play or compliance adds on the link side of a joint: a second joint, a tendon."""
+TETHER_SUFFIX, ANCHOR_SUFFIX = "__tether", "__anchor"
+"""Endings of the names of a tether's tendon and site on a body, and of the site where it is fixed."""
 
 
 @dataclass(frozen=True)

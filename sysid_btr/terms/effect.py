@@ -22,6 +22,8 @@ THRESHOLDS = (0.6, 0.72, 0.85, 1.0, 1.15, 1.3, 1.5)
 
 GROUND = "a free base on the ground"
 """What an effect `needs` that a robot on a fixed base cannot show."""
+HELD_BASE = "a base that does not move"
+"""... that a robot on a free base cannot: where it is in the world is not measured."""
 COMMANDS = "commands that are replayed"
 """What an effect `needs` whose variable would else be the torque that it is to explain."""
 

@@ -53,7 +53,7 @@ from sysid_btr.terms.servo import (
     Kv,
     TorqueConstant,
 )
-from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow
+from sysid_btr.terms.spring import JointSpring, JointStop, JointStopBelow, Tether
 from sysid_btr.terms.transmission import (
     Backlash,
     BacklashGreased,
@@ -97,6 +97,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     JointSpring,
     JointStop,
     JointStopBelow,
+    Tether,
     EncoderOffset,
     EncoderOffsetInLoop,
     EncoderScale,

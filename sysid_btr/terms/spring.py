@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Fields, Kind
-from sysid_btr.terms.effect import Effect, Probe
+from sysid_btr.terms.base import ANCHOR_SUFFIX, TETHER_SUFFIX, BatchModel, Fields, Kind
+from sysid_btr.terms.effect import HELD_BASE, Effect, Probe
 from sysid_btr.terms.law import Step
 from sysid_btr.terms.scales import JointScale
 
@@ -137,3 +137,109 @@ class JointStopBelow(JointStop):
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
         for p, j in enumerate(places):
             step.joint_torque[j] += numbers[p, 0] * max(numbers[p, 1] - step.qpos[j], 0.0)
+
+
+LEVER = 0.1
+"""m, at which a pull makes a torque of the usual size."""
+NEAR, FAR = 0.4, 1.2
+"""m, to where a tether is held, from which a search begins."""
+STIFF = (0.5, 2.0, 8.0)
+"""Stiffness, in tensions over the distance, likewise."""
+
+
+@dataclass(frozen=True)
+class Tether(Effect):
+    """A cable, hose or band from a point of a body to a fixed one in the world: it pulls, and never pushes.
+
+    Its numbers are what it does in the pose where all joints of the model are at zero: the force on the body, which
+    goes towards the fixed point; by how much that grows with its length; how far away the fixed point is; and where it
+    holds the body, from the centre of mass, in the body's frame.
+
+    Structure: a tendon between two sites; native `tendon_stiffness`, `tendon_lengthspring`, `site_pos`.
+    """
+
+    name: ClassVar[str] = "tether"
+    family: ClassVar[str] = "spring"
+    title: ClassVar[str] = "cable or band from outside"
+    scope: ClassVar = "body"
+    needs: ClassVar[str] = HELD_BASE
+    structural: ClassVar[bool] = True
+    signed: ClassVar[bool] = True
+    main: ClassVar[int] = 3
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        *(Kind(f"pull_{axis}", "N", 0.0, -200.0, 200.0, 1.0) for axis in "xyz"),
+        Kind("stiffness", "N/m", 0.0, 0.0, 1000.0, 5.0),
+        Kind("distance", "m", 1.0, 0.05, 5.0, 0.2),
+        *(Kind(axis, "m", 0.0, -0.2, 0.2, 0.02) for axis in "xyz"),
+    )
+    held: ClassVar[tuple[str, ...]] = ("stiffness", "distance", *"xyz")
+    details: ClassVar[tuple[str, ...]] = ("distance", *"xyz")
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("payload", "the same body in another orientation to gravity, or fast motion"),
+        ("joint_spring", "motion of other joints, which turns the pull"),
+        ("gravity_tilt", "a body that it does not hold"),
+    )
+
+    @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        pull = scale.torque_rms / LEVER
+        return (
+            *(Kind(k.name, k.unit, 0.0, -20 * pull, 20 * pull, 0.3 * pull) for k in cls.kinds[:3]),
+            Kind("stiffness", "N/m", 0.0, 0.0, 100 * pull / FAR, pull / FAR),
+            *cls.kinds[4:],
+        )
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        pull = cls.sized(scale)[0].scale
+        return (tuple((*row, 0.0, FAR, 0.0, 0.0, 0.0) for row in (pull * np.eye(3)).tolist()),)
+
+    @classmethod
+    def initial_guesses(cls, values: FloatArray) -> FloatArray:
+        tension = float(np.linalg.norm(values[:3]))
+        ways = [(stiff * tension / far, far) for far in (NEAR, FAR) for stiff in STIFF]
+        return np.array([[*values[:3], *way, *values[5:]] for way in ways])
+
+    @property
+    def begin(self) -> FloatArray:
+        """A small pull: where there is none, nothing responds to where it comes from."""
+        kinds = self.numbers * len(self.groups)
+        return np.array([p.scale if k.unit == "N" else p.nominal for k, p in zip(kinds, self.parameters, strict=True)])
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        for name in self.places:
+            ends = (
+                spec.body(name).add_site(name=name + TETHER_SUFFIX),
+                spec.worldbody.add_site(name=name + ANCHOR_SUFFIX),
+            )
+            tendon = spec.add_tendon(name=name + TETHER_SUFFIX)
+            for site in ends:
+                tendon.wrap_site(site.name)
+
+    def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
+        import mujoco
+
+        model, data = batch.model, mujoco.MjData(batch.model)
+        data.qpos[:] = model.qpos0
+        mujoco.mj_kinematics(model, data)
+        fields = {name: batch.read(name) for name in ("site_pos", "tendon_stiffness", "tendon_lengthspring")}
+        for place, name in enumerate(self.places):
+            own = values[:, place]
+            body, tendon = model.body(name).id, model.tendon(name + TETHER_SUFFIX).id
+            near, far = (model.site(name + end).id for end in (TETHER_SUFFIX, ANCHOR_SUFFIX))
+            point, distance = model.body_ipos[body] + own[:, 5:8], own[:, 4]
+            tension = np.linalg.norm(own[:, :3], axis=1)
+            way = (
+                np.where(tension[:, None] > 0, own[:, :3], [0.0, 0.0, 1.0])
+                / np.where(tension > 0, tension, 1.0)[:, None]
+            )
+            # a pull that does not grow is one that grows by next to nothing
+            stiffness = np.maximum(own[:, 3], 1e-3 * tension / distance)
+            held = data.xpos[body] + point @ data.xmat[body].reshape(3, 3).T
+            fields["site_pos"][:, near], fields["site_pos"][:, far] = point, held + distance[:, None] * way
+            fields["tendon_stiffness"][:, tendon] = stiffness
+            slack = tension / np.where(stiffness > 0, stiffness, 1.0)
+            fields["tendon_lengthspring"][:, tendon] = np.stack(
+                [np.minimum(distance - slack, 0.0), distance - slack], axis=1
+            )
+        return fields

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.intervals import Estimate
-from sysid_btr.terms.base import LINK_SUFFIX
+from sysid_btr.terms.base import ANCHOR_SUFFIX, LINK_SUFFIX, TETHER_SUFFIX
 from sysid_btr.units import with_digits_of
 from sysid_btr.writeback.features import INTEGRATORS, Feature, Kind, count, differ, of_kind
 from sysid_btr.writeback.native import Part
@@ -139,7 +139,10 @@ def _place(model: mujoco.MjModel, kind: Kind, i: int) -> tuple[str, str]:
         return name or joint, joint
     if kind == "body":
         return name, name.removeprefix("payload_")
-    return name, name.removesuffix(LINK_SUFFIX)
+    place = name
+    for added in (LINK_SUFFIX, TETHER_SUFFIX, ANCHOR_SUFFIX):
+        place = place.removesuffix(added)
+    return name, place
 
 
 def place_of(model: mujoco.MjModel, change: Change) -> str:

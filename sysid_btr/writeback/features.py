@@ -15,7 +15,7 @@ from sysid_btr.writeback.xmltext import number, numbers
 if TYPE_CHECKING:
     import mujoco
 
-Kind = Literal["option", "body", "joint", "geom", "actuator", "tendon"]
+Kind = Literal["option", "body", "joint", "geom", "site", "actuator", "tendon"]
 Attributes = dict[str, str | None]
 Read = Callable[["mujoco.MjModel", int], FloatArray]
 Write = Callable[["mujoco.MjModel", "mujoco.MjModel", int, float], Attributes]
@@ -197,8 +197,8 @@ def _write_integrator(_: mujoco.MjModel, model: mujoco.MjModel, _i: int, _angle:
     return {"integrator": INTEGRATORS[int(model.opt.integrator)]}
 
 
-def _tendon_damping(model: mujoco.MjModel, i: int) -> FloatArray:
-    return np.concatenate([[model.tendon_damping[i]], model.tendon_dampingpoly[i]])
+def _tendon(name: str) -> Read:
+    return lambda model, i: np.append(getattr(model, f"tendon_{name}")[i], getattr(model, f"tendon_{name}poly")[i])
 
 
 def _make_features() -> Iterator[Feature]:
@@ -226,11 +226,14 @@ def _make_features() -> Iterator[Feature]:
     yield stated("geom", "friction", "geom_friction", _at("geom_friction"))
     yield stated("geom", "solref", "geom_solref", _at("geom_solref"))
     yield stated("geom", "solimp", "geom_solimp", _at("geom_solimp"))
+    yield stated("site", "pos", "site_pos", _at("site_pos"))
     yield Feature("actuator", "gains", ("actuator_gainprm", "actuator_biasprm"), _gains)
     limits = ("actuator_forcerange", "actuator_forcelimited")
     yield Feature("actuator", "forcerange", limits, _force_range, _write_force_range)
     yield Feature("actuator", "delay", ("actuator_delay", "actuator_history"), _delay, _write_delay)
-    yield stated("tendon", "damping", "tendon_damping tendon_dampingpoly", _tendon_damping, _short)
+    for label in ("damping", "stiffness"):
+        yield stated("tendon", label, f"tendon_{label} tendon_{label}poly", _tendon(label), _short)
+    yield stated("tendon", "springlength", "tendon_lengthspring", _at("tendon_lengthspring"))
 
 
 FEATURES: tuple[Feature, ...] = tuple(_make_features())
@@ -239,7 +242,14 @@ FEATURES: tuple[Feature, ...] = tuple(_make_features())
 WRITTEN = frozenset(name for feature in FEATURES for name in feature.fields)
 """Compiled fields that a file states."""
 
-COUNTS: Mapping[Kind, str] = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "actuator": "nu", "tendon": "ntendon"}
+COUNTS: Mapping[Kind, str] = {
+    "body": "nbody",
+    "joint": "njnt",
+    "geom": "ngeom",
+    "site": "nsite",
+    "actuator": "nu",
+    "tendon": "ntendon",
+}
 
 
 def count(model: mujoco.MjModel, kind: Kind) -> int:

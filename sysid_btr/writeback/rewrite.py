@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.writeback.features import Attributes, Kind, count, differ, of_kind, same, significant, tensor
+from sysid_btr.writeback.features import COUNTS, Attributes, Kind, count, differ, of_kind, same, significant, tensor
 from sysid_btr.writeback.xmltext import (
     Edit,
     Element,
@@ -40,7 +40,7 @@ TAG = "sysid_btr:"
 ORIENTATION = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
 
 
-KINDS: tuple[Kind, ...] = ("option", "body", "joint", "geom", "actuator", "tendon")
+KINDS: tuple[Kind, ...] = ("option", *COUNTS)
 
 
 class CannotWriteError(ValueError):
@@ -97,7 +97,7 @@ def compile_text(text: bytes) -> Compiled:
     from sysid_btr.simulation.silence import silenced
 
     root = parse(text)
-    named: dict[Kind, dict[str, Element]] = {k: {} for k in ("body", "joint", "geom", "actuator", "tendon")}
+    named: dict[Kind, dict[str, Element]] = {k: {} for k in COUNTS}
     edits = []
     for element in root.walk():
         kind = _kind(element)
@@ -119,6 +119,7 @@ def compile_text(text: bytes) -> Compiled:
         kind: [found.get(getattr(model, kind)(i).name) for i in range(count(model, kind))]
         for kind, found in named.items()
     }
+    elements["body"][0] = next((e for e in root.children if e.tag == "worldbody"), None)
     return Compiled(
         text=text,
         root=root,
@@ -139,7 +140,7 @@ def _kind(element: Element) -> Kind | None:
         return "actuator" if above[0] == "actuator" else "tendon"
     if "worldbody" not in above:
         return None
-    kinds: dict[str, Kind] = {"body": "body", "joint": "joint", "freejoint": "joint", "geom": "geom"}
+    kinds: dict[str, Kind] = {"body": "body", "joint": "joint", "freejoint": "joint", "geom": "geom", "site": "site"}
     return kinds.get(element.tag)
 
 
@@ -158,7 +159,7 @@ def rewrite(text: bytes, target: mujoco.MjModel, notes: Mapping[tuple[Kind, str]
         If no change of attributes does that.
     """
     now = compile_text(add_structure(compile_text(text), target, notes))
-    for kind in ("body", "joint", "geom", "actuator", "tendon"):
+    for kind in COUNTS:
         _check_order(now, target, kind)
     for _ in range(ROUNDS):
         edits = list(_edits(now, target))
@@ -206,7 +207,7 @@ def _edits(now: Compiled, target: mujoco.MjModel) -> list[Edit]:
         result += _compiler(now, {"settotalmass": "-1"})
     else:
         result += [edit for i in bodies for edit in _body_edits(now, target, i)]
-    for kind in ("joint", "geom", "tendon"):
+    for kind in ("joint", "geom", "site", "tendon"):
         for i in range(count(target, kind)):
             values: Attributes = {}
             for feature in of_kind(kind):
@@ -379,7 +380,7 @@ def _general(now: Compiled, target: mujoco.MjModel, i: int, element: Element) ->
 
 
 def add_structure(now: Compiled, target: mujoco.MjModel, notes: Mapping[tuple[Kind, str], str]) -> bytes:
-    """The text with the bodies, joints and tendons that the wanted model has more."""
+    """The text with the bodies, joints, sites and tendons that the wanted model has more."""
     edits: list[Edit] = []
     bodies = {now.model.body(i).name: i for i in range(now.model.nbody)}
     children: dict[int, list[str]] = {}
@@ -387,6 +388,12 @@ def add_structure(now: Compiled, target: mujoco.MjModel, notes: Mapping[tuple[Ki
         if target.body(i).name not in bodies:
             parent = bodies[target.body(int(target.body_parentid[i])).name]
             children.setdefault(parent, []).extend([*_note(notes, "body", target.body(i).name), _body(target, i)])
+    sites = {now.model.site(i).name for i in range(now.model.nsite)}
+    for i in range(target.nsite):
+        if target.site(i).name not in sites | {""}:
+            body = bodies[target.body(int(target.site_bodyid[i])).name]
+            site = {"name": target.site(i).name, "pos": numbers(target.site_pos[i])}
+            children.setdefault(body, []).append(element_text("site", site))
     for parent, pieces in children.items():
         edits.append(append_child(now.text, now.at("body", parent), pieces))
     joints = {now.model.joint(i).name for i in range(now.model.njnt)}
@@ -447,16 +454,25 @@ def _joint(now: Compiled, target: mujoco.MjModel, i: int) -> str:
 
 
 def _tendon(target: mujoco.MjModel, i: int) -> str:
-    """A fixed tendon over joints, such as one that damps both sides of a gear."""
+    """A tendon over joints, such as one that damps both sides of a gear, or from site to site."""
+    import mujoco
+
     first, size = int(target.tendon_adr[i]), int(target.tendon_num[i])
+    over = range(first, first + size)
+    own = {"name": target.tendon(i).name}
+    for feature in of_kind("tendon"):
+        if feature.write is not None:
+            own |= {k: v for k, v in feature.write(target, target, i, 1.0).items() if v is not None}
+    if target.wrap_type[first] == mujoco.mjtWrap.mjWRAP_SITE:
+        ends = [element_text("site", {"site": target.site(int(target.wrap_objid[w])).name}) for w in over]
+        return element_text("spatial", own, ends)
     wraps = [
         element_text(
             "joint", {"joint": target.joint(int(target.wrap_objid[w])).name, "coef": number(target.wrap_prm[w])}
         )
-        for w in range(first, first + size)
+        for w in over
     ]
-    damping = numbers([target.tendon_damping[i], *target.tendon_dampingpoly[i]])
-    return element_text("fixed", {"name": target.tendon(i).name, "damping": damping}, wraps)
+    return element_text("fixed", own, wraps)
 
 
 def _key_edits(now: Compiled, target: mujoco.MjModel, added: Sequence[int]) -> list[Edit]:
