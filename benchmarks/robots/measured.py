@@ -257,7 +257,7 @@ def _regression(model: Path, log: Path, sums: Sequence[tuple[str, str]]) -> Any:
 
 
 def _effects(result: Mapping[str, Any]) -> dict[tuple[str, str], _Found]:
-    """(effect or effect.kind, joint) -> value and interval."""
+    """(effect.kind, or effect for its first one, joint) -> value and interval."""
     found: dict[tuple[str, str], _Found] = {}
     for entry in result.get("effects", ()):
         for p in entry["parameters"]:
@@ -265,7 +265,7 @@ def _effects(result: Mapping[str, Any]) -> dict[tuple[str, str], _Found]:
             kind = label.rpartition(".")[2]
             interval = None if p["ci95"][0] is None else (p["ci95"][0], p["ci95"][1])
             for place in places.split(","):
-                found[entry["effect"], place] = (p["value"], interval)
+                found.setdefault((entry["effect"], place), (p["value"], interval))
                 found[f"{entry['effect']}.{kind}", place] = (p["value"], interval)
     return found
 

@@ -88,9 +88,9 @@ def _ways(found: Sequence[Estimate], jacobian: FloatArray, pattern: Pattern) -> 
         if not normal[i, i] > 0:
             continue
         along = np.where(part == part[i], responses(normal, i), 0.0)
-        rise = float(along @ normal @ along)
+        rise = max(float(along @ normal @ along), 0.0)  # rounding may make less of nothing
         alone = np.eye(len(found))[i]
-        directions = [along] if rise <= 0 else [alone]
+        directions = [alone] if rise > 0 else [along]
         if rise > 0 and normal[i, i] > AMONG_OTHERS * rise:
             directions.append(along)
         rows = [_rows(pattern, d) for d in directions]

@@ -160,7 +160,7 @@ class Tether(Effect):
 
     name: ClassVar[str] = "tether"
     family: ClassVar[str] = "spring"
-    title: ClassVar[str] = "cable or band from outside"
+    title: ClassVar[str] = "pull of a cable or band"
     scope: ClassVar = "body"
     needs: ClassVar[str] = HELD_BASE
     structural: ClassVar[bool] = True
