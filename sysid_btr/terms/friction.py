@@ -182,7 +182,9 @@ class StribeckFriction(Effect):
 
 @dataclass(frozen=True)
 class PreslidingFriction(Effect):
-    """Dry friction that bends before it slides: grease, seals, teeth that give (Dahl 1968, doi:10.21236/ADA041920).
+    """Dry friction that bends before it slides: grease, seals, teeth that give.
+
+    Dahl's model (Canudas de Wit et al. 1995, doi:10.1109/9.376053).
 
     Law: torque = -torque z / deflection, z' = v - |v| z / deflection from z = 0; exact for the velocity of a step.
     """
