@@ -174,6 +174,7 @@ class Tether(Effect):
     )
     held: ClassVar[tuple[str, ...]] = ("stiffness", "distance", *"xyz")
     details: ClassVar[tuple[str, ...]] = ("distance", *"xyz")
+    includes: ClassVar[tuple[str, ...]] = ("constant_force",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("payload", "the same body in another orientation to gravity, or fast motion"),
         ("joint_spring", "motion of other joints, which turns the pull"),
