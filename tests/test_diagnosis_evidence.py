@@ -10,10 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.diagnosis.certainty import STANDARD
-from sysid_btr.diagnosis.evidence import left_where_it_acts, preference, share_explained, weights
+from sysid_btr.diagnosis.evidence import evidence_of, left_where_it_acts, preference, share_explained, weights
+from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.selection import STANDARD as RULES
+from sysid_btr.diagnosis.trials import Trial
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.simulation.numerics import Numerics
+from sysid_btr.terms.disturbance import ConstantForce
+from sysid_btr.terms.effect import Effect
+from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.spring import JointSpring, Tether
 
 COUNT = 50.0
 """Samples in a stretch."""
@@ -58,6 +65,26 @@ def test_models_that_leave_alike_weigh_alike_and_a_parameter_costs_what_it_gains
     same = [left(even(2.0)), left(even(2.0))]
     np.testing.assert_allclose(weights(same, same[0], [1, 1]), [0.5, 0.5])
     np.testing.assert_allclose(weights(same, same[0], [1, 2]), [1 / (1 + np.exp(-1)), 1 / (1 + np.e)])
+
+
+def test_what_holds_a_name_as_a_special_case_says_it_too() -> None:
+    """A spring so soft, or a band so long, that its torque is constant: no evidence against a constant torque."""
+
+    def trial(effect: type[Effect], place: str) -> Trial:
+        return Trial(Hypothesis(effect, (place,), False, np.zeros(len(effect.kinds)), 1.0), left(even(2.0)))
+
+    constant = trial(ConstantForce, "knee")
+    wider = [trial(JointSpring, "knee"), trial(Tether, "shank")]
+    known = evidence_of(RULES, constant, [constant, *wider])
+    assert (known.family, known.place) == (pytest.approx(1.0), pytest.approx(1.0))
+    assert not known.others
+    assert {h.effect for h in known.alternatives} <= {JointSpring, Tether}
+    assert known.alternatives
+    rubbing = evidence_of(RULES, constant, [constant, trial(CoulombFriction, "knee")])
+    assert rubbing.family == pytest.approx(0.5, abs=0.05)
+    assert set(rubbing.others) == {"friction"}
+    # and not the other way round
+    assert evidence_of(RULES, wider[0], [constant, wider[0]]).family < 0.6
 
 
 def test_the_weight_of_a_clear_difference_is_that_of_the_likelihood() -> None:

@@ -20,6 +20,7 @@ from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.trials import Trial, is_rival
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.terms.effect import family_of
+from sysid_btr.terms.free_form import FREE_FORMS
 
 DRAWS = 400
 """Bayesian bootstrap draws over stretches: a weight is known to 0.025 at worst."""
@@ -59,20 +60,28 @@ def evidence_of(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Evi
     finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
     share = weights([t.fitted for t in finite], winner.fitted, [t.hypothesis.complexity for t in finite])
     own, places = family_of(winner.hypothesis.effect), set(winner.hypothesis.places)
+    tried: dict[str, float] = {}
     others: dict[str, float] = {}
     best: dict[str, tuple[float, Hypothesis]] = {}
     family = place = 0.0
     for trial, weight in zip(finite, share, strict=True):
-        name = family_of(trial.hypothesis.effect)
-        family += weight * (name == own)
-        place += weight * bool(places & set(trial.hypothesis.places))
+        name, same = family_of(trial.hypothesis.effect), _is_a_case_of(winner.hypothesis, trial.hypothesis)
+        family += weight * (name == own or same)
+        place += weight * (same or bool(places & set(trial.hypothesis.places)))
         if name != own:
-            others[name] = others.get(name, 0.0) + float(weight)
+            tried[name] = tried.get(name, 0.0) + float(weight)
+            others[name] = others.get(name, 0.0) + float(weight) * (not same)
             best[name] = max(best.get(name, (0.0, trial.hypothesis)), (weight, trial.hypothesis), key=lambda x: x[0])
     told = dict(sorted(((n, w) for n, w in others.items() if w > LEAST_WEIGHT), key=lambda x: -x[1]))
-    alternatives = tuple(best[name][1] for name in told)
+    likely = sorted((n for n, w in tried.items() if w > LEAST_WEIGHT), key=lambda n: -tried[n])
+    alternatives = tuple(best[name][1] for name in likely)
     rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
     return Evidence(rivals, float(family), float(place), told, alternatives)
+
+
+def _is_a_case_of(one: Hypothesis, other: Hypothesis) -> bool:
+    """Whether another law says the same and more, of which the log shows nothing: else that would have been added."""
+    return other.effect not in FREE_FORMS and one.effect.name in other.effect.includes
 
 
 def is_likely(rules: Selection, before: Fitted, winner: Trial, trials: Sequence[Trial]) -> bool:
