@@ -318,7 +318,7 @@ PLANTS = [
     Plant(JointCompliance(KNEE), (0.03,), rivals=("backlash",)),
     Plant(JointSpring(KNEE), (1.0, 0.3), rivals=("encoder_scale",)),
     Plant(JointStop(KNEE), (3.0, 0.1)),
-    Plant(Tether(("ankle",)), (2.0, 0.5, -2.0, 12.0, 0.5, 0.02, 0.0, -0.02), tested=3),
+    Plant(Tether(("ankle",)), (2.9, 12.0, 0.35, 0.1, -0.35, 0.02, 0.0, -0.02), tested=0),
     Plant(TorqueLimit(KNEE), (1.0,), rivals=("speed_torque_limit",)),
     Plant(TorqueLimitSoft(KNEE), (1.5,)),
     Plant(SpeedTorqueLimit(KNEE), (2.0, 6.0), rivals=("torque_limit",)),

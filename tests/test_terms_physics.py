@@ -239,22 +239,22 @@ def test_a_tether_pulls_a_point_towards_another_and_never_pushes(
     pull: tuple[float, ...], stiffness: float, distance: float, point: tuple[float, float]
 ) -> None:
     x, z = point[0], point[1] - LENGTH
-    anchor = np.array([x, 0.0, z]) + distance * np.array(pull) / np.linalg.norm(pull)
+    tension = float(np.linalg.norm(pull))
+    to = distance * np.array(pull) / tension
+    anchor = np.array([x, 0.0, z]) + to
 
     def torque(q: float) -> float:
         held = np.array([x * np.cos(q) + z * np.sin(q), 0.0, z * np.cos(q) - x * np.sin(q)])
         cord = anchor - held
         long = float(np.linalg.norm(cord))
         # one that does not grow is a band so soft that it grows by a thousandth over its length
-        growth = max(stiffness, 1e-3 * float(np.linalg.norm(pull)) / distance)
-        tension = max(float(np.linalg.norm(pull)) + growth * (long - distance), 0.0)
-        return tension * float(held[2] * cord[0] - held[0] * cord[2]) / long
+        growth = max(stiffness, 1e-3 * tension / distance)
+        now = max(tension + growth * (long - distance), 0.0)
+        return now * float(held[2] * cord[0] - held[0] * cord[2]) / long
 
     for command in (-0.6, COMMAND):
         q = solve(lambda q, command=command: KP * (command - q) - gravity(q) + torque(q))
-        assert rest(Tether, [*pull, stiffness, distance, point[0], 0.0, point[1]], command) == pytest.approx(
-            q, abs=1e-6
-        )
+        assert rest(Tether, [tension, stiffness, *to, point[0], 0.0, point[1]], command) == pytest.approx(q, abs=1e-6)
 
 
 @pytest.mark.parametrize(("stop", "way"), [(JointStop, 1.0), (JointStopBelow, -1.0)])

@@ -1,8 +1,8 @@
 """Where no law of the library fits: of which variable the missing torque is a smooth function, and which one.
 
 The torque that a model lacks is regressed on the curves of every free form (`sysid_btr.terms.free_form`) at its joint,
-which costs no replay; stretches of time that a curve did not see say how much of the torque it predicts. What is
-returned can be tried and refitted like any other hypothesis.
+which costs no replay but for errors of an encoder over segments; stretches of time that a curve did not see say how
+much of the torque it predicts. What is returned can be tried and refitted like any other hypothesis.
 """
 
 from __future__ import annotations
@@ -177,8 +177,11 @@ def _evidence(
     noise = next((float(t.noise[t.joints.index(one.joint)]) for t in targets if t.channel == "position"), 0.0)
     # a segment starts from what the sensor shows, and goes where that leads
     started = isinstance(episode.replay, SegmentReplay)
-    columns = _replayed_modes(effect, one, problem, values, scales) if started else design(effect, one, ends)
-    return _Evidence(one, one.residual * noise, noise, lambda: columns)
+
+    def columns() -> FloatArray:
+        return _replayed_modes(effect, one, problem, values, scales) if started else design(effect, one, ends)
+
+    return _Evidence(one, one.residual * noise, noise, columns)
 
 
 def _replayed_modes(
@@ -193,8 +196,8 @@ def _replayed_modes(
     replay = problem.with_model(model).episodes[one.episode].replay
     with silenced():
         outputs = replay.predict(candidates)
-    position = np.nan_to_num(outputs.position[:, :, replay.index.joints.index(one.joint)])
-    change = (position[1:] - position[0]) / size[:, None]
+    position = outputs.position[:, :, replay.index.joints.index(one.joint)]
+    change = np.nan_to_num(position[1:] - position[0]) / size[:, None]
     return np.column_stack([np.interp(one.time, outputs.time, row) for row in change])
 
 

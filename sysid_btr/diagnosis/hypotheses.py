@@ -226,9 +226,9 @@ def _without_idle(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypoth
 
 
 def _idle(h: Hypothesis, rules: Selection) -> bool:
-    main = h.start[h.effect.main :: len(h.effect.kinds)]
-    size = np.abs(h.start).max()
-    return bool(np.all(np.abs(main) <= rules.idle * size))
+    kinds, start = h.effect.kinds, np.abs(h.start.reshape(-1, len(h.effect.kinds)))
+    alike = [kind.unit == kinds[h.effect.main].unit for kind in kinds]
+    return bool(np.all(start[:, h.effect.main] <= rules.idle * start[:, alike].max()))
 
 
 def _varied(ranked: Sequence[Hypothesis], rules: Selection) -> list[Hypothesis]:

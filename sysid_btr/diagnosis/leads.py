@@ -24,7 +24,7 @@ from sysid_btr.identify.refit import inflate, judge, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.models.robot import body_names, joint_names
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.terms.base import Scope
+from sysid_btr.terms.base import LINK_SUFFIX, TETHER_SUFFIX, Scope
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
@@ -136,4 +136,13 @@ def _perturbations(state: State, library: Library, problem: ReplayProblem, resid
     asked: list[Perturbation] = perturbations(library, places, study.scales)
     asked += proposals(study, problem, problem.start, residual[: problem.count], library)
     terms = state.fitted.model.terms
+    taken = _with_parts_of_terms(study)
+    asked = [q for q in asked if not (q.effect.structural and taken & set(q.places))]
     return [q for q in asked if terms.admit(q.effect, q.places)]
+
+
+def _with_parts_of_terms(study: Study) -> set[str]:
+    """Joints and bodies that the model itself, as an earlier run may have written it, gives what such terms add."""
+    model = study.robot.model
+    names = [model.joint(i).name for i in range(model.njnt)] + [model.site(i).name for i in range(model.nsite)]
+    return {n.removesuffix(end) for n in names for end in (LINK_SUFFIX, TETHER_SUFFIX) if n.endswith(end)}

@@ -107,12 +107,23 @@ class Replay:
             start = initial_state(self.log, joints, resting(self.robot, self.log, joints))
         else:
             start = self.begun.position.copy(), self.begun.velocity.copy()
-        return coupled_state(self.model, self.index, *start, ~self.shown)
+        return coupled_state(self.model, self.index, *start, ~self._logged)
+
+    @cached_property
+    def _logged(self) -> BoolArray:
+        """(j,) which joints have their position in the log."""
+        return np.array([self.log.has("position", joint) for joint in self.index.joints], dtype=bool)
 
     @cached_property
     def shown(self) -> BoolArray:
-        """(j,) which joints have their position in the log."""
-        return np.array([self.log.has("position", joint) for joint in self.index.joints], dtype=bool)
+        """(j,) which joints start where a sensor's error leaves them, and not where the log says.
+
+        None that others follow by an equality, or that a servo without commands holds where it starts.
+        """
+        if self.model.neq and not self._logged.all():
+            return np.zeros(len(self.index.joints), dtype=bool)
+        commanded = np.array([self.log.has("command", joint) for joint in self.index.joints], dtype=bool)
+        return self._logged & (commanded | ~self.index.driven_by("position"))
 
     @cached_property
     def idle(self) -> tuple[FloatArray, dict[str, float]]:

@@ -77,7 +77,7 @@ def behind_sensors(
     Parameters
     ----------
     batch, pairs : the candidates, and the terms they differ in.
-    shown : (j,) or (m, j) joints whose sensors are logged; others start where they are.
+    shown : (j,) or (m, j) joints of which that is so; others start where the log says.
     qpos, qvel : (m, j) as the sensors show them.
     acceleration : (m, j), by which the motion about the start bends.
     began : s on the clock of the log at the start, (m,) or of all.

@@ -186,7 +186,8 @@ class PreslidingFriction(Effect):
 
     Dahl's model (Canudas de Wit et al. 1995, doi:10.1109/9.376053).
 
-    Law: torque = -torque z / deflection, z' = v - |v| z / deflection from z = 0; exact for the velocity of a step.
+    Law: torque = -torque z / deflection, z' = v - |v| z / deflection from z = 0, in every segment too; exact for the
+    velocity of a step.
     """
 
     name: ClassVar[str] = "coulomb_friction"

@@ -145,15 +145,17 @@ NEAR, FAR = 0.4, 1.2
 """m, to where a tether is held, from which a search begins."""
 STIFF = (0.5, 2.0, 8.0)
 """Stiffness, in tensions over the distance, likewise."""
+SHORTEST, SOFTEST = 0.01, 1e-3
+"""m, of a tether at least; stiffness of one whose pull does not grow, in tensions over its length."""
 
 
 @dataclass(frozen=True)
 class Tether(Effect):
     """A cable, hose or band from a point of a body to a fixed one in the world: it pulls, and never pushes.
 
-    Its numbers are what it does in the pose where all joints of the model are at zero: the force on the body, which
-    goes towards the fixed point; by how much that grows with its length; how far away the fixed point is; and where it
-    holds the body, from the centre of mass, in the body's frame.
+    Its numbers are what it is in the pose where the model's joints are at their reference: its tension; by how much
+    that grows with its length; where the fixed point is, from the one that it holds, in the world; and where it holds
+    the body, from the centre of mass, in the body's frame.
 
     Structure: a tendon between two sites; native `tendon_stiffness`, `tendon_lengthspring`, `site_pos`.
     """
@@ -165,15 +167,13 @@ class Tether(Effect):
     needs: ClassVar[str] = HELD_BASE
     structural: ClassVar[bool] = True
     signed: ClassVar[bool] = True
-    main: ClassVar[int] = 3
     kinds: ClassVar[tuple[Kind, ...]] = (
-        *(Kind(f"pull_{axis}", "N", 0.0, -200.0, 200.0, 1.0) for axis in "xyz"),
+        Kind("tension", "N", 0.0, 0.0, 200.0, 1.0),
         Kind("stiffness", "N/m", 0.0, 0.0, 1000.0, 5.0),
-        Kind("distance", "m", 1.0, 0.05, 5.0, 0.2),
+        *(Kind(f"to_{axis}", "m", at, -5.0, 5.0, 0.2) for axis, at in zip("xyz", (0.0, 0.0, FAR), strict=True)),
         *(Kind(axis, "m", 0.0, -0.2, 0.2, 0.02) for axis in "xyz"),
     )
-    held: ClassVar[tuple[str, ...]] = ("stiffness", "distance", *"xyz")
-    details: ClassVar[tuple[str, ...]] = ("distance", *"xyz")
+    details: ClassVar[tuple[str, ...]] = ("to_x", "to_y", "to_z", *"xyz")
     includes: ClassVar[tuple[str, ...]] = ("constant_force",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("payload", "the same body in another orientation to gravity, or fast motion"),
@@ -183,23 +183,35 @@ class Tether(Effect):
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        pull = scale.torque_rms / LEVER
+        pull = scale.torque_rms / (1.0 if scale.slide else LEVER)
         return (
-            *(Kind(k.name, k.unit, 0.0, -20 * pull, 20 * pull, 0.3 * pull) for k in cls.kinds[:3]),
+            Kind("tension", "N", 0.0, 0.0, 20 * pull, 0.3 * pull),
             Kind("stiffness", "N/m", 0.0, 0.0, 100 * pull / FAR, pull / FAR),
-            *cls.kinds[4:],
+            *cls.kinds[2:],
         )
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        """The same tension along each axis."""
         pull = cls.sized(scale)[0].scale
-        return (tuple((*row, 0.0, FAR, 0.0, 0.0, 0.0) for row in (pull * np.eye(3)).tolist()),)
+        return (tuple((pull, 0.0, *way, 0.0, 0.0, 0.0) for way in (FAR * np.eye(3)).tolist()),)
+
+    @classmethod
+    def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
+        """The probe's directions are pulls: they add, whatever their signs."""
+        force = np.asarray(amounts, dtype=np.float64) * probe[0][0]
+        tension = float(np.linalg.norm(force))
+        if tension == 0:
+            return None
+        most = cls.sized(scale)[0].upper
+        return np.array([min(tension, most), 0.0, *(FAR * force / tension), 0.0, 0.0, 0.0])
 
     @classmethod
     def initial_guesses(cls, values: FloatArray) -> FloatArray:
-        tension = float(np.linalg.norm(values[:3]))
-        ways = [(stiff * tension / far, far) for far in (NEAR, FAR) for stiff in STIFF]
-        return np.array([[*values[:3], *way, *values[5:]] for way in ways])
+        tension, way = float(values[0]), values[2:5] / max(float(np.linalg.norm(values[2:5])), SHORTEST)
+        return np.array(
+            [[tension, stiff * tension / far, *(far * way), *values[5:]] for far in (NEAR, FAR) for stiff in STIFF]
+        )
 
     @property
     def begin(self) -> FloatArray:
@@ -209,38 +221,45 @@ class Tether(Effect):
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         for name in self.places:
-            ends = (
-                spec.body(name).add_site(name=name + TETHER_SUFFIX),
-                spec.worldbody.add_site(name=name + ANCHOR_SUFFIX),
-            )
+            spec.body(name).add_site(name=name + TETHER_SUFFIX)
+            spec.worldbody.add_site(name=name + ANCHOR_SUFFIX)
             tendon = spec.add_tendon(name=name + TETHER_SUFFIX)
-            for site in ends:
-                tendon.wrap_site(site.name)
+            for end in (TETHER_SUFFIX, ANCHOR_SUFFIX):
+                tendon.wrap_site(name + end)
 
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        import mujoco
-
-        model, data = batch.model, mujoco.MjData(batch.model)
-        data.qpos[:] = model.qpos0
-        mujoco.mj_kinematics(model, data)
+        model = batch.model
         fields = {name: batch.read(name) for name in ("site_pos", "tendon_stiffness", "tendon_lengthspring")}
         for place, name in enumerate(self.places):
-            own = values[:, place]
             body, tendon = model.body(name).id, model.tendon(name + TETHER_SUFFIX).id
-            near, far = (model.site(name + end).id for end in (TETHER_SUFFIX, ANCHOR_SUFFIX))
-            point, distance = model.body_ipos[body] + own[:, 5:8], own[:, 4]
-            tension = np.linalg.norm(own[:, :3], axis=1)
-            way = (
-                np.where(tension[:, None] > 0, own[:, :3], [0.0, 0.0, 1.0])
-                / np.where(tension > 0, tension, 1.0)[:, None]
-            )
-            # a pull that does not grow is one that grows by next to nothing
-            stiffness = np.maximum(own[:, 3], 1e-3 * tension / distance)
-            held = data.xpos[body] + point @ data.xmat[body].reshape(3, 3).T
-            fields["site_pos"][:, near], fields["site_pos"][:, far] = point, held + distance[:, None] * way
-            fields["tendon_stiffness"][:, tendon] = stiffness
-            slack = tension / np.where(stiffness > 0, stiffness, 1.0)
-            fields["tendon_lengthspring"][:, tendon] = np.stack(
-                [np.minimum(distance - slack, 0.0), distance - slack], axis=1
-            )
+            near, anchor = (model.site(name + end).id for end in (TETHER_SUFFIX, ANCHOR_SUFFIX))
+            origin, turn = _placed(batch, body)
+            centre = batch.read("body_ipos")[:, body]
+            tension, stiffness, to, point = np.split(values[:, place], (1, 2, 5), axis=1)
+            length = np.maximum(np.linalg.norm(to, axis=1, keepdims=True), SHORTEST)
+            stiffness = np.maximum(stiffness, SOFTEST * tension / length)
+            rest = length - tension / np.where(stiffness > 0, stiffness, 1.0)
+            fields["site_pos"][:, near] = centre + point
+            fields["site_pos"][:, anchor] = origin + np.einsum("mij,mj->mi", turn, centre + point) + to
+            fields["tendon_stiffness"][:, tendon] = stiffness[:, 0]
+            # equal ends below zero would ask for a length of MuJoCo's own
+            fields["tendon_lengthspring"][:, tendon] = np.hstack([np.where(rest < 0, rest - 1, 0.0), rest])
         return fields
+
+
+def _placed(batch: BatchModel, body: int) -> tuple[FloatArray, FloatArray]:
+    """Where a body's frame is in the world at the reference pose, (m, 3), and how it is turned, (m, 3, 3)."""
+    import mujoco
+
+    # joints' places differ where logs differ, and in no term
+    differing = [batch.fields[name] for name in ("body_pos", "body_quat", "qpos0") if name in batch.fields]
+    origin, turn = np.empty((batch.size, 3)), np.empty((batch.size, 3, 3))
+    known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    for i in range(batch.size):
+        own = b"".join(rows[i].tobytes() for rows in differing)
+        if own not in known:
+            data = mujoco.MjData(model := batch.candidate(i) if differing else batch.model)
+            mujoco.mj_kinematics(model, data)
+            known[own] = data.xpos[body].copy(), data.xmat[body].reshape(3, 3).copy()
+        origin[i], turn[i] = known[own]
+    return origin, turn
