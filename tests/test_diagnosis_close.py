@@ -18,6 +18,7 @@ from sysid_btr.diagnosis.elimination import eliminate
 from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.leads import leading_hypotheses
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, where_something_is
 from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
@@ -33,6 +34,7 @@ from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
@@ -282,9 +284,11 @@ def recorded(plant: Plant | None, seed: int = 0) -> Log:
     return seen_by_encoders(plant, motion(), OTHERWISE, seed)
 
 
-def seen_by_encoders(plant: Plant | None, log: Log, numerics: Numerics, seed: int = 0) -> Log:
-    robot = toys.leg()
-    declared = make_study(robot, [log], numerics=toys.FINE).declare(("mass:knee", "kp:*=shared"))
+def seen_by_encoders(
+    plant: Plant | None, log: Log, numerics: Numerics, seed: int = 0, robot: Robot | None = None
+) -> Log:
+    robot = toys.leg() if robot is None else robot
+    declared = make_study(robot, [log], numerics=toys.FINE).declare(("mass:*knee", "kp:*=shared"))
     effects = (plant.effect,) if plant else ()
     values = [TRUE_MASS, TRUE_KP, *(plant.values if plant else ())]
     effort = plant is not None and plant.effort
@@ -303,6 +307,30 @@ def seen_by_encoders(plant: Plant | None, log: Log, numerics: Numerics, seed: in
 
 def diagnose(plant: Plant | None) -> Closing:
     return close(make_study(toys.leg(), [recorded(plant)]), TOY_FIT)
+
+
+def test_a_tether_is_named_where_bodies_are_not_called_as_their_joints_and_its_pull_hardly_grows() -> None:
+    xml = toys.LEG
+    for name in toys.LEG_JOINTS:
+        xml = xml.replace(f'<body name="{name}"', f'<body name="{name}_link"')
+    robot = toys.robot_from_xml(xml.replace('name="knee_link"', 'name="shin_knee"'), "leg")
+    plant = Plant(Tether(("ankle_link",)), (2.9, 0.0, 3.5, 0.5, -3.5, 0.0, 0.0, 0.0))
+    log = seen_by_encoders(plant, motion(), OTHERWISE, robot=robot)
+    found = close(make_study(robot, [log]), ("mass:shin_knee", *GAINS))
+    effect = only_effect(found)
+    assert (found.verdict, effect.effect, effect.where) == ("explained", "tether", ("ankle_link",))
+    assert amount_is(effect, 0, 2.9), effect
+
+
+@pytest.mark.parametrize("had", [Backlash(("knee",)), Tether(("knee",))], ids=lambda had: had.name)
+def test_a_model_that_has_what_an_earlier_run_added_is_scanned_again(had: Effect) -> None:
+    """... for everything but that at the same place, which would have the same name."""
+    robot = toys.with_spec(toys.leg(), had.edit_spec)
+    study = make_study(robot, [recorded(Plant(CoulombFriction(("knee",)), (0.15,)))], numerics=toys.FINE)
+    library = (CoulombFriction, type(had))
+    found, _ = leading_hypotheses(State.of(fit(study, TOY_FIT), None), library, STANDARD)
+    assert any(h.effect is CoulombFriction and h.places == ("knee",) for h in found)
+    assert not any(h.effect is type(had) and "knee" in h.places for h in found)
 
 
 KNEE = ("knee",)

@@ -132,7 +132,11 @@ def _weighed(study: Study, model: Model) -> Study:
 def _perturbations(state: State, library: Library, problem: ReplayProblem, residual: FloatArray) -> list[Perturbation]:
     """What a scan asks for: a term already at a location is not, as it is refitted with everything else."""
     study = state.study
-    places: dict[str, tuple[str, ...]] = {scope: study.robot.names(scope) for scope in get_args(Scope)}
+    # the second joint of a play or a compliance is no place of its own
+    places: dict[str, tuple[str, ...]] = {
+        scope: tuple(name for name in study.robot.names(scope) if not name.endswith(LINK_SUFFIX))
+        for scope in get_args(Scope)
+    }
     asked: list[Perturbation] = perturbations(library, places, study.scales)
     asked += proposals(study, problem, problem.start, residual[: problem.count], library)
     terms = state.fitted.model.terms
