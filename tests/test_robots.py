@@ -48,6 +48,17 @@ def test_another_drive_comes_to_the_right_answer(name: str, tmp_path: Path) -> N
     assert answer.answer == "right", (answer, found.message)
 
 
+def test_friction_beyond_the_torque_of_the_plain_model_is_found(tmp_path: Path) -> None:
+    """A tendon closes two fingers: what holds them is more than the plain model's drive ever gives at a finger."""
+    case, log = short("tendon_gripper")
+    study = make_study(nominal(case, tmp_path), [log], threads=1)
+    found = close(study, ["mass:*"], effects=("coulomb_friction", "viscous_damping", "command_delay"))
+    answer = judge(found.to_dict() | {"verdict": "explained"}, case.planted, case.alike)
+    assert answer.answer == "right", (answer, found.message)
+    held = study.scales["left"].counter_peak + study.scales["right"].counter_peak
+    assert sum(p.value for e in found.effects for p in e.parameters) > held
+
+
 def test_the_suite_has_what_it_says() -> None:
     assert len(SUITE) >= 12
     assert sum(not case.planted for case in SUITE.values()) >= 2

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid_btr.terms.base import Term
+from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.inertial import ComOffset, Mass
 from sysid_btr.terms.model import Model, Terms, as_model
@@ -87,6 +88,7 @@ def test_what_was_worked_out_of_terms_is_not_sent() -> None:
 def test_what_is_free_for_all_places_alike_leaves_each_its_own() -> None:
     alike, own = Terms([Kp(("a", "b"), shared=True)]), Terms([Kp(("a", "b"))])
     assert alike.admit(Kp, ("a",))
+    assert not alike.admit(Kp, ("b", "a"))
     assert not own.admit(Kp, ("b", "c"))
     assert own.admit(Kp, ("c",))
 
@@ -96,3 +98,14 @@ def test_a_joint_is_split_once() -> None:
     assert not play.admit(JointCompliance, ("b", "a"))
     assert play.admit(JointCompliance, ("b",))
     assert play.admit(CoulombFriction, ("a",))
+
+
+def test_a_bound_grows_until_it_holds_what_was_found_unless_it_is_stated_or_physical() -> None:
+    free = Parameter("coulomb_friction:a", "Nm", 0.0, 0.0, 0.5, 0.1)
+    assert free.holding(0.4) == free
+    assert free.holding(3.0).upper == pytest.approx(12.5)
+    assert free.holding(-1.0) == free
+    assert replace(free, stated=True).holding(3.0).upper == 0.5
+    assert Parameter("voltage_sag", "1", 0.0, 0.0, 0.9, 0.1).holding(1.2).upper == 0.9
+    assert Parameter("encoder_offset:a", "rad", 0.0, -0.1, 0.1, 0.01).holding(-0.2).lower == pytest.approx(-0.5)
+    assert Parameter("mass:a", "1", 1.0, 0.3, 3.0, 0.1).holding(0.2).lower == pytest.approx(0.06)

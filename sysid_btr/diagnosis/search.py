@@ -31,7 +31,8 @@ from sysid_btr.diagnosis.trials import (
     is_outdone,
     is_superfluous,
 )
-from sysid_btr.estimators.base import Progress
+from sysid_btr.estimators.base import Budget, Progress
+from sysid_btr.identify.bounds import fit_beyond
 from sysid_btr.identify.recorder import as_recorded, own_steps
 from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.progress import phase
@@ -189,6 +190,8 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
         fitted = refit(study, rest.with_(hypothesis.term(study.scales), hypothesis.start))
     study = study.with_initial_states(fitted.model)
     study, fitted = robust_refit(study, fitted, 1)
+    # how large an effect can be follows from the plain model's motion, which is not the robot's
+    fitted = fit_beyond(study, fitted, Budget(), first=len(state.first.model.values))
     state = replace(state, study=study, fitted=fitted, evidence=(*staying, evidence)).spent(spent + fitted.evaluations)
     if at_floor(rules, fitted) and (recorded := as_recorded(study, fitted.model)) is not study:
         state = _in_steps(state, recorded.numerics, fitted.model)

@@ -8,12 +8,10 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, Progress, silent
-from sysid_btr.estimators.lsq import linearise
-from sysid_btr.identify.bounds import grow_bounds, on_bounds
+from sysid_btr.identify.bounds import fit_beyond
 from sysid_btr.identify.numerics import Beginning, converged, held_numerics
 from sysid_btr.identify.recorder import as_recorded
 from sysid_btr.identify.refit import Fitted, best_start, inflate, judge, nearby, refit, robust_refit, shorten
-from sysid_btr.identify.step_check import Optimum
 from sysid_btr.identify.study import Study
 from sysid_btr.identify.thresholds import with_reached_limits, without_unreached_limits
 from sysid_btr.terms.model import Model
@@ -51,16 +49,9 @@ def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress
 
 def _explained_beyond(study: Study, coarse: Fitted, budget: Budget, progress: Progress) -> Fitted:
     """A first fit, beyond bounds that nobody stated where it explains the log there: no error of the model then."""
-    model, spent = coarse.model, coarse.evaluations
-    if not on_bounds(model).any():
-        return coarse
-    problem, step = study.train_problem(model), study.stencil(model.terms)
-    residual, jacobian = linearise(problem, model.values, step=step)
-    spent += 2 * len(model.values) + 1
-    at, more = grow_bounds(study, Optimum(problem, model.values, jacobian, residual), budget.after(spent), progress)
-    spent += more
-    wider = judge(study, at.problem.model.at(at.values), spent) if more else coarse
-    return replace(wider if float(wider.train_columns.max()) <= MISFIT else coarse, evaluations=spent)
+    wider = fit_beyond(study, coarse, budget, progress)
+    explained = float(wider.train_columns.max()) <= MISFIT
+    return wider if explained else replace(coarse, evaluations=wider.evaluations)
 
 
 def realise_servo(study: Study, model: Model) -> Study:

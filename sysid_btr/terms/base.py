@@ -28,6 +28,10 @@ TETHER_SUFFIX, ANCHOR_SUFFIX = "__tether", "__anchor"
 """Endings of the names of a tether's tendon and site on a body, and of the site where it is fixed."""
 
 
+GROWTH = 5.0
+"""Factor by which a bound that nobody stated grows."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One number that a candidate carries.
@@ -57,6 +61,21 @@ class Parameter:
         """The same with bounds that are no further than `reach` from a value, and the nominal value within them."""
         low, high = max(value - reach, self.lower), min(value + reach, self.upper)
         return replace(self, nominal=min(max(self.nominal, low), high), lower=low, upper=high)
+
+    def wider(self, side: float) -> Parameter:
+        """The same with its upper (side 1) or lower (-1) bound grown, unless it is stated or set by physics."""
+        # a ratio stays below one, whatever the data want
+        if self.stated or (side > 0 and self.unit == "1" and self.upper <= 1):
+            return self
+        if side > 0:
+            return replace(self, upper=GROWTH * self.upper)
+        return replace(self, lower=GROWTH * self.lower if self.lower < 0 else self.lower / GROWTH)
+
+    def holding(self, value: float) -> Parameter:
+        """The same with bounds that have grown until a value that was found is within them."""
+        side = float(value > self.upper) - float(value < self.lower)
+        grown = self.wider(side) if side else self
+        return self if grown == self else grown.holding(value)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -106,8 +106,9 @@ class Effect(Term):
         )
 
     def around(self, values: FloatArray) -> Effect:
-        """The effect with bounds narrowed to where a search from these values makes sense."""
-        return self
+        """The effect with bounds between which a search from these values makes sense: wide enough to hold them."""
+        known = tuple(p.holding(float(v)) for p, v in zip(self.parameters, values, strict=True))
+        return self if known == self.parameters else replace(self, known=known)
 
     @classmethod
     def is_threshold(cls) -> bool:

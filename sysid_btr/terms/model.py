@@ -91,15 +91,15 @@ class Terms(tuple[Term, ...]):
     def admit(self, kind: type[Term], places: Iterable[str]) -> bool:
         """Whether a further term may act at these places.
 
-        Not where one of its kind is free already, with numbers of each place's own, and not where another adds a joint
-        and it does too.
+        Not where one of its kind is free already, with numbers of each place's own or at just these places, and not
+        where another adds a joint and it does too.
         """
         at = set(places)
 
         def excludes(term: Term) -> bool:
             own = len(term.groups) == len(term.places) and term.numbers == term.kinds
             return bool(at.intersection(term.places)) and (
-                (type(term) is kind and own) or (term.structural and kind.structural)
+                (type(term) is kind and (own or at == set(term.places))) or (term.structural and kind.structural)
             )
 
         return not any(excludes(term) for term in self)
