@@ -572,8 +572,17 @@ def test_a_soft_supply_weakens_the_servo_with_its_own_load(supply: type[Effect])
         asked, flowing = KP * (COMMAND - q), gravity(q)
         return asked * (1 - 0.3 * abs(flowing)) - flowing
 
-    q = rest(supply, [0.3])
+    q = rest(supply, [0.3, 0.0])
     assert balance(q) == pytest.approx(0, abs=1e-8)
+
+
+@pytest.mark.parametrize("supply", [VoltageSagLoad, VoltageSagLoadStiffness])
+def test_a_supply_with_a_lag_rests_where_one_without_does(supply: type[Effect]) -> None:
+    early, late, at_once = (
+        rest(supply, [0.3, lag], seconds=seconds) for lag, seconds in ((0.5, 0.3), (0.1, 8.0), (0.0, 8.0))
+    )
+    assert late == pytest.approx(at_once, abs=1e-6)
+    assert abs(early - rest(supply, [0.3, 0.0], seconds=0.3)) > 1e-4
 
 
 def test_heat_weakens_the_servo_until_it_gives_off_what_it_takes() -> None:

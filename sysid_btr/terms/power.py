@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,6 +12,9 @@ from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.law import Step, used_in_laws
 from sysid_btr.terms.scales import JointScale
 
+LAGS = (0.0, 0.1)
+"""s, of a supply, that a scan asks for."""
+
 
 @used_in_laws
 def total_torque(step: Step, places: IntArray) -> float:
@@ -18,6 +22,19 @@ def total_torque(step: Step, places: IntArray) -> float:
     total = 0.0
     for j in places:
         total += abs(step.torque[j])
+    return total
+
+
+@used_in_laws
+def load_of_supply(step: Step, lag: float, memory: FloatArray, places: IntArray) -> float:
+    """The same as it has reached the supply's voltage, after a lag (s); it begins settled.
+
+    Memory: the load of the last step, and whether there was one.
+    """
+    total = total_torque(step, places)
+    if memory[0, 1] > 0 and lag > 0:
+        total += (memory[0, 0] - total) * math.exp(-step.timestep / lag)
+    memory[0, 0], memory[0, 1] = total, 1.0
     return total
 
 
@@ -52,41 +69,47 @@ class VoltageSag(Effect):
 
 @dataclass(frozen=True)
 class VoltageSagLoad(VoltageSag):
-    """Law: gain = 1 - ratio * sum of all servo torques; a supply with inner resistance.
+    """Law: gain = 1 - ratio * sum of all servo torques, after a lag; a supply with inner resistance and capacity.
 
-    The torques are those that flow, which the gain has weakened already: gain = 1 / (1 + ratio * those asked for).
+    The torques are those that flow, which the gain has weakened already: gain = 1 / (1 + ratio * those asked for). The
+    lag is that of a battery's or a converter's voltage (Chen and Rincon-Mora 2006, doi:10.1109/TEC.2006.874229).
     """
 
     title: ClassVar[str] = "loss of supply voltage per unit of total torque"
     variant: ClassVar[str] = "load"
-    kinds: ClassVar[tuple[Kind, ...]] = (Kind("ratio", "1/Nm", 0.0, 0.0, 1.0, 0.01),)
+    law_memory: ClassVar[int] = 2
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("ratio", "1/Nm", 0.0, 0.0, 1.0, 0.01),
+        Kind("lag", "s", 0.0, 0.0, 1.0, 0.02),
+    )
+    held: ClassVar[tuple[str, ...]] = ("lag",)
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
         size = 0.02 / max(scale.torque_rms, 1e-9)
-        return (Kind("ratio", "1/Nm", 0.0, 0.0, 20 * size, size),)
+        return (Kind("ratio", "1/Nm", 0.0, 0.0, 20 * size, size), cls.kinds[1])
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
-        return (((cls.sized(scale)[0].scale,),),)
+        return tuple(((cls.sized(scale)[0].scale, lag),) for lag in LAGS)
 
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
-        total = total_torque(step, places)
+        total = load_of_supply(step, numbers[0, 1], memory, places)
         for j in places:
             step.gain[j] /= 1 + numbers[0, 0] * total
 
 
 @dataclass(frozen=True)
 class VoltageSagLoadStiffness(VoltageSagLoad):
-    """Law: stiffness = 1 - ratio * sum of all servo torques, and damping stays: a firmware limits its P term."""
+    """Law: stiffness = 1 - ratio * sum of all servo torques, after a lag; damping stays, as firmware limits P alone."""
 
     title: ClassVar[str] = "loss of stiffness per unit of total torque"
     variant: ClassVar[str] = "load_stiffness"
 
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
-        lost = 1 - 1 / (1 + numbers[0, 0] * total_torque(step, places))
+        lost = 1 - 1 / (1 + numbers[0, 0] * load_of_supply(step, numbers[0, 1], memory, places))
         for j in places:
             step.motor_torque[j] -= lost * step.gain[j] * step.proportional[j]
 
