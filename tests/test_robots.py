@@ -53,6 +53,8 @@ def test_friction_beyond_the_torque_of_the_plain_model_is_found(tmp_path: Path) 
     case, log = short("tendon_gripper")
     study = make_study(nominal(case, tmp_path), [log], threads=1)
     found = close(study, ["mass:*"], effects=("coulomb_friction", "viscous_damping", "command_delay"))
+    assert found.verdict in ("explained", "partly_explained"), found.message
+    # names and amounts: the friction that was planted is smooth, and a trace of that is left
     answer = judge(found.to_dict() | {"verdict": "explained"}, case.planted, case.alike)
     assert answer.answer == "right", (answer, found.message)
     held = study.scales["left"].counter_peak + study.scales["right"].counter_peak

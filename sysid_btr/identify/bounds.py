@@ -47,7 +47,9 @@ def grow_bounds(study: Study, at: Optimum, budget: Budget, progress: Progress, f
 def fit_beyond(study: Study, fitted: Fitted, budget: Budget, progress: Progress = silent, first: int = 0) -> Fitted:
     """A fitted model, fitted again where parameters from the `first` on lie on bounds that can grow and data press."""
     model, spent = fitted.model, fitted.evaluations
-    if not on_bounds(model)[first:].any():
+    side = on_bounds(model)
+    side[:first] = 0.0
+    if grown(model.terms, side) is None:
         return fitted
     problem, step = study.train_problem(model), study.stencil(model.terms)
     residual, jacobian = linearise(problem, model.values, step=step)
@@ -68,7 +70,7 @@ def on_bounds(model: Model) -> FloatArray:
 def pressing(at: Optimum) -> FloatArray:
     """(p,) -1 and 1 where an estimate lies on its lower and upper bound and data want it beyond; else 0.
 
-    By the paired t of stretches of time, few of which can press as evenly as many.
+    That is where the mean pull of stretches of time is many of its standard errors, however few stretches there are.
     """
     blocks, side = at.problem.blocks, on_bounds(Model(at.problem.terms, at.values))
     for i in np.flatnonzero(side):

@@ -27,7 +27,7 @@ def total_torque(step: Step, places: IntArray) -> float:
 
 @used_in_laws
 def load_of_supply(step: Step, lag: float, memory: FloatArray, places: IntArray) -> float:
-    """The same as it has reached the supply's voltage, after a lag (s); it begins settled.
+    """Sum of the servos' torques as the supply's voltage follows it, after a lag (s); it begins settled.
 
     Memory: the load of the last step, and whether there was one.
     """
