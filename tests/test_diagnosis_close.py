@@ -36,7 +36,7 @@ from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.disturbance import ConstantForce
+from sysid_btr.terms.disturbance import ConstantForce, RingingDisturbance, RingingDisturbanceTrain
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FreeTorquePeriodic
 from sysid_btr.terms.friction import (
@@ -355,6 +355,8 @@ PLANTS = [
     Plant(Payload(("ankle",)), (0.15, 0.05, 0.0, -0.05, 5e-5), rivals=("com_offset",), tested=None),
     Plant(ComOffset(("ankle",)), (0.03, 0.0, -0.03), rivals=("payload",), tested=None),
     Plant(ConstantForce(KNEE), (0.2,), effort=True),
+    Plant(RingingDisturbance(KNEE), (0.5, 1.9, 3.3, 0.3)),
+    Plant(RingingDisturbanceTrain(KNEE), (-0.3, 0.8, 2.6, 0.25, 1.4)),
     Plant(EncoderOffset(KNEE), (0.03,), effort=True, tested=None),
     Plant(EncoderCyclicError(KNEE), (0.015, -0.01, 17.0)),
     Plant(Cogging(KNEE), (0.25, 0.1, 17.0)),

@@ -16,8 +16,11 @@ from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
+from sysid_btr.diagnosis.close import usable_effects
+from sysid_btr.diagnosis.proposals import proposals
+from sysid_btr.diagnosis.ringing import blows
 from sysid_btr.diagnosis.scan import Perturbation
-from sysid_btr.diagnosis.signature import proposals, signature
+from sysid_btr.diagnosis.signature import signature
 from sysid_btr.identify.missing_torque import MissingTorque, missing_torques
 from sysid_btr.identify.refit import refit
 from sysid_btr.identify.study import Study, make_study
@@ -25,7 +28,14 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.emps import emps
-from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbance, ExternalDisturbanceTrain, pulses
+from sysid_btr.terms.disturbance import (
+    DriveDisturbanceTrain,
+    ExternalDisturbance,
+    ExternalDisturbanceTrain,
+    Push,
+    RingingDisturbance,
+    RingingDisturbanceTrain,
+)
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.library import select_effects
@@ -78,6 +88,14 @@ def asked(log: Log, library: Sequence[type[Effect]] = select_effects(["all"])) -
     study = study_of(log)
     problem = study.train_problem(())
     return proposals(study, problem, NOTHING, problem.residuals(np.zeros((1, 0)))[0], library)
+
+
+def torque_of(torque: FloatArray) -> MissingTorque:
+    """A torque as it would be missing at a joint whose own motion has nothing to do with it."""
+    knee = torques_of(leg_log())["knee"]
+    n = len(torque)
+    state = {name: np.resize(getattr(knee, name), n) for name in ("position", "velocity", "acceleration", "residual")}
+    return replace(knee, **state, time=knee.period * np.arange(n), torque=torque, gain=np.ones_like(knee.gain))
 
 
 def described(log: Log) -> dict[str, Any]:
@@ -165,9 +183,41 @@ def test_only_effects_of_the_library_are_proposed() -> None:
 
 @pytest.mark.parametrize("effort", [False, True])
 def test_pulses_in_the_drive_are_asked_for_only_where_an_effort_could_show_them(effort: bool) -> None:
-    found = asked(leg_log(DriveDisturbanceTrain, "knee", (0.5, 0.3, 0.2, 0.9), effort=effort))
-    assert any(q.effect is ExternalDisturbanceTrain for q in found)
-    assert any(q.effect is DriveDisturbanceTrain for q in found) is effort
+    log = leg_log(DriveDisturbanceTrain, "knee", (0.5, 0.3, 0.2, 0.9), effort=effort)
+    trains = usable_effects((ExternalDisturbanceTrain, DriveDisturbanceTrain), study_of(log))
+    assert {q.effect for q in asked(log, trains)} == set(trains)
+    assert (DriveDisturbanceTrain in trains) is effort
+
+
+def test_a_blow_that_rings_is_proposed_when_and_as_it_was() -> None:
+    found = asked(leg_log(RingingDisturbance, values=(0.6, 3.21, 2.7, 0.4)))
+    rings = [q for q in found if issubclass(q.effect, RingingDisturbance)]
+    assert [(q.effect, q.places) for q in rings] == [(RingingDisturbance, ("knee",))]
+    assert rings[0].probe[0][1:] == pytest.approx((3.21, 2.7, 0.4), rel=0.1, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("start", "period"), [(0.9, 1.9), (2.6, 2.1)], ids=["from the beginning", "first later than a period"]
+)
+def test_blows_that_come_again_are_proposed_as_a_train(start: float, period: float) -> None:
+    found = asked(leg_log(RingingDisturbanceTrain, "ankle", (-0.4, start, 3.4, 0.3, period)))
+    (train,) = (q for q in found if q.effect is RingingDisturbanceTrain)
+    assert train.places == ("ankle",)
+    assert train.probe[0][1:] == pytest.approx((start, 3.4, 0.3, period), rel=0.1, abs=0.02)
+    assert train.probe[0][4] == pytest.approx(period, abs=0.01)
+
+
+@pytest.mark.parametrize("frequency", [1.3, 4.1])
+def test_what_never_dies_away_is_no_blow(frequency: float) -> None:
+    wave = np.sin(2 * np.pi * frequency * 0.01 * np.arange(900))
+    assert blows(torque_of(wave)) == (None, None)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_any_colour_does_not_ring(seed: int) -> None:
+    white = noise(900, seed)
+    smooth = np.convolve(white, np.ones(20) / 20, "same")
+    assert [blows(torque_of(x)) for x in (white, smooth)] == [(None, None)] * 2
 
 
 # --- pulse trains as effects ------------------------------------------------------------------------------
@@ -182,7 +232,7 @@ def test_pulses_in_the_drive_are_asked_for_only_where_an_effort_could_show_them(
 )
 def test_a_train_gives_the_impulse_of_its_pulses(start: float, duration: float, period: float, step: float) -> None:
     time = step * np.arange(round(3.0 / step) + 1)
-    given_torque = pulses(np.array([[2.0, start, duration, period]]), time[None])[0]
+    given_torque = ExternalDisturbanceTrain.mean_torque(np.array([[2.0, start, duration, period]]), time[None])[0]
     begins = start + period * np.arange(200)
     ends = begins + min(duration, period)
     exact = 2.0 * np.sum(np.clip(np.minimum(ends, time[-1]) - np.minimum(begins, time[-1]), 0, None))
@@ -215,12 +265,48 @@ def test_a_pulse_in_the_drive_moves_like_a_push_and_shows_in_the_effort() -> Non
     assert difference == pytest.approx(0.5 * on[:-1], abs=1e-6)
 
 
-@pytest.mark.parametrize("effect", [ExternalDisturbance, ExternalDisturbanceTrain])
-def test_bounds_around_a_guess_let_a_fit_refine_its_times(
-    effect: type[ExternalDisturbance] | type[ExternalDisturbanceTrain],
+@settings(max_examples=50, deadline=None)
+@given(
+    start=st.floats(0.0, 1.0),
+    frequency=st.floats(0.2, 15.0),
+    decay=st.floats(0.02, 2.0),
+    period=st.floats(0.1, 2.0),
+    step=st.sampled_from([0.001, 0.004, 0.01]),
+)
+def test_a_train_of_blows_gives_the_sum_of_what_each_rings(
+    start: float, frequency: float, decay: float, period: float, step: float
 ) -> None:
-    truth = np.array([0.6, 1.013, 0.204, 1.3][: len(effect.kinds)])
-    guess = np.array([0.5, 1.03, 0.18, 1.302][: len(effect.kinds)])
+    time = step * np.arange(round(3.0 / step) + 1)
+    given_torque = RingingDisturbanceTrain.mean_torque(np.array([[2.0, start, frequency, decay, period]]), time[None])
+    each = [
+        RingingDisturbance.mean_torque(np.array([[2.0, start + k * period, frequency, decay]]), time[None])
+        for k in range(int(3.0 / period) + 1)
+    ]
+    assert given_torque == pytest.approx(np.sum(each, axis=0), abs=1e-9)
+
+
+def test_a_blow_rings_as_a_damped_oscillator_that_was_struck() -> None:
+    frequency, decay, start, step = 2.5, 0.4, 0.3, 1e-4
+    time = step * np.arange(20001)
+    torque = RingingDisturbance.mean_torque(np.array([[0.7, start, frequency, decay]]), time[None])[0]
+    since = time[:-1] + 0.5 * step - start
+    rings = 0.7 * np.exp(-since / decay) * np.sin(2 * np.pi * frequency * since)
+    assert torque == pytest.approx(np.where(since > 0, rings, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("effect", "truth", "guess"),
+    [
+        (ExternalDisturbance, (0.6, 1.013, 0.204), (0.5, 1.03, 0.18)),
+        (ExternalDisturbanceTrain, (0.6, 1.013, 0.204, 1.3), (0.5, 1.03, 0.18, 1.302)),
+        (RingingDisturbance, (0.6, 1.013, 2.7, 0.41), (0.5, 1.05, 2.5, 0.3)),
+        (RingingDisturbanceTrain, (0.6, 1.013, 2.7, 0.41, 1.7), (0.5, 1.05, 2.5, 0.3, 1.71)),
+    ],
+)
+def test_bounds_around_a_guess_let_a_fit_refine_its_times(
+    effect: type[Push], truth: tuple[float, ...], guess: tuple[float, ...]
+) -> None:
+    guess, truth = np.array(guess), np.array(truth)
     study = study_of(leg_log(effect, values=truth))
     pulse = effect.at(("knee",), study.scales).around(guess)
     assert all(p.lower <= g <= p.upper for p, g in zip(pulse.parameters, guess, strict=True))

@@ -12,9 +12,9 @@ import numpy as np
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.diagnosis.free_form import free_forms
 from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_together, form_hypotheses, from_arrays, to_arrays
+from sysid_btr.diagnosis.proposals import proposals
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, perturbations, responding, scan
 from sysid_btr.diagnosis.selection import Selection
-from sysid_btr.diagnosis.signature import proposals
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.journal import Record
 from sysid_btr.estimators.lsq import linearise

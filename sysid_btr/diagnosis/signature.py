@@ -1,53 +1,37 @@
-"""What the residual looks like: proposals for effects with a place in time or angle, and words for the rest.
+"""What a model leaves, in words: where and when, and on what it depends.
 
-Both look at the torque that would explain the position error (`sysid_btr.identify.missing_torque`), because a torque
+It looks at the torque that would explain the position error (`sysid_btr.identify.missing_torque`), because a torque
 is local in time where a position error is smeared out by the servo.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
-from sysid_btr.diagnosis.scan import Perturbation
-from sysid_btr.diagnosis.signal_features import Line, Train, best_sampling, hats, predicted_share, without
+from sysid_btr.diagnosis.patterns import (
+    LOUD,
+    SHORTEST_PERIOD,
+    TRAIN_SHARE,
+    blame,
+    is_own_rhythm,
+    of_motion,
+    scaled,
+    spatial_lines,
+    upright,
+)
+from sysid_btr.diagnosis.signal_features import hats, predicted_share, without
 from sysid_btr.identify.missing_torque import MissingTorque, missing_torques
 from sysid_btr.identify.study import Study
-from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.terms.disturbance import DriveDisturbanceTrain, ExternalDisturbance, ExternalDisturbanceTrain
-from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
-from sysid_btr.terms.sensing import EncoderCyclicError
-from sysid_btr.terms.servo import CommandDelaySampled
-from sysid_btr.terms.transmission import Cogging
 
-LOUD = 1.3
-"""Chi2 of a joint's position from which its error is looked at."""
-SMALL = 0.01
-"""Excess, relative to the worst joint's, below which a joint has to wait."""
-CLEAR = 50.0
-"""A pulse stands out if it explains this many times what noise of the same colour would."""
-SHORTEST_PULSE = 0.02
-SHORTEST_PERIOD = 0.3
-"""Seconds."""
 OUTLIER = 3.0
 """Times the usual size from which a torque of either sign counts as an event."""
-EVEN = 0.3
-"""Difference, relative to a pulse, below which pulses and gaps are equally far from no torque."""
-TRAIN_SHARE = 0.15
-"""Share of the variance that a pulse train, or intervals between commands, must explain to be proposed."""
-LINE_SHARE, LINE_CLEAR = 0.03, 8.0
-"""Share of the variance that a spatial frequency must explain, alone and relative to the median one."""
-LINES = 2
-ONCE_AND_TWICE = (1.0, 2.0)
-"""1/rad; an encoder off its centre errs once a turn, one that is bent twice, whatever part of a turn is seen."""
-OWN_RHYTHM = 0.6
-"""Share of the velocity that repeats with a period, from which that period is the motion's own."""
 STRETCH, SHORT_STRETCH = 2.5, 0.5
 """Seconds that are predicted from the others when a dependence on a state, and on time, is weighed."""
 MOSTLY = 0.5
@@ -57,179 +41,7 @@ NEARLY = 0.07
 WEAK = 0.2
 """Share of the missing torque below which a dependence is none."""
 DESCRIBED = 3
-"""Joints that are described, and in whose torque intervals between commands are sought."""
-
-
-def proposals(
-    study: Study, problem: ReplayProblem, values: FloatArray, residual: FloatArray, library: Sequence[type[Effect]]
-) -> list[Perturbation]:
-    """Perturbations at effects whose place in time or angle only the residual shows.
-
-    Parameters
-    ----------
-    study : robot and logs.
-    problem, values : data, terms and their parameters.
-    residual : (r,) whitened, there.
-    library : effects that may be asked for.
-    """
-    pushes = {ExternalDisturbance, ExternalDisturbanceTrain, DriveDisturbanceTrain}
-    wanted = {Cogging, EncoderCyclicError, CommandDelaySampled, *pushes} & set(library)
-    if not wanted or not np.any(problem.column_chi2(residual) >= LOUD):
-        return []
-    asked: list[Perturbation] = []
-    torques = missing_torques(problem, values, study.scales)
-    worst = max((_blame(t) for t in torques), default=0.0)
-    loud = [t for t in torques if t.chi2 >= LOUD and _blame(t) >= SMALL * worst]
-    worst_first = sorted(loud, key=_blame, reverse=True)
-    for one in loud:
-        scale, place = study.scales[one.joint], (one.joint,)
-        if Cogging in wanted:
-            asked += [Perturbation(Cogging, place, Cogging.probe_at(scale, x.number)) for x in spatial_lines(one)]
-        if EncoderCyclicError in wanted:
-            numbers = (*ONCE_AND_TWICE, *(x.number for x in spatial_lines(_of_reading(one))))
-            asked += [Perturbation(EncoderCyclicError, place, EncoderCyclicError.probe_at(scale, n)) for n in numbers]
-        moments = sampling(one) if CommandDelaySampled in wanted and one in worst_first[:DESCRIBED] else None
-        if moments is not None:
-            asked.append(Perturbation(CommandDelaySampled, place, CommandDelaySampled.probe_at(*moments)))
-        push = single_pulse(one) if ExternalDisturbance in wanted else None
-        # pulses of a train that differ are no pushes that come again: what they follow is something else
-        if push is not None and not _within_train(problem, values, one.joint, *push):
-            asked.append(Perturbation(ExternalDisturbance, place, ExternalDisturbance.probe_at(scale, *push)))
-        train = pulse_train(one)
-        if train is None:
-            continue
-        when = (train.start, train.duration, train.period)
-        if ExternalDisturbanceTrain in wanted:
-            probe = ExternalDisturbanceTrain.probe_at(scale, *when)
-            asked.append(Perturbation(ExternalDisturbanceTrain, place, probe))
-        # without a measured effort both trains leave the same trace
-        if DriveDisturbanceTrain in wanted and any(t.channel == "effort" for t in problem.episodes[0].targets):
-            probe = DriveDisturbanceTrain.probe_at(scale, *when)
-            asked.append(Perturbation(DriveDisturbanceTrain, place, probe))
-    return asked
-
-
-def _of_reading(one: MissingTorque) -> MissingTorque:
-    """The error of the position in the place of the torque that would explain it."""
-    return replace(one, torque=one.residual, noise=1.0, gain=np.ones_like(one.gain))
-
-
-def _within_train(problem: ReplayProblem, values: FloatArray, joint: str, start: float, duration: float) -> bool:
-    """Whether a pulse is at the time of one of those that the model already has at this joint."""
-    for term, own in problem.terms.split(values):
-        if isinstance(term, ExternalDisturbanceTrain) and joint in term.places:
-            _, first, long, period = term.spread(own[None])[0, term.places.index(joint)]
-            # since the train's pulse that began last before this one ends
-            if (start + duration - first) % period < duration + long:
-                return True
-    return False
-
-
-def _unit(x: FloatArray) -> FloatArray:
-    """Centred, with a largest value of one."""
-    centred = x - x.mean()
-    return np.asarray(centred / max(float(np.abs(centred).max()), 1e-300))
-
-
-def _of_motion(one: MissingTorque, degree: int = 3) -> FloatArray:
-    """What friction, inertia, springs and gravity explain, to be set aside before searching; (n, 3 + degree)."""
-    q = _unit(one.position)
-    powers = [q**k for k in range(1, degree + 1)]
-    columns = (one.direction, one.velocity, one.acceleration, *powers)
-    return one.seen(np.column_stack([_unit(c) for c in columns]))
-
-
-def spatial_lines(one: MissingTorque) -> list[Line]:
-    """Spatial frequencies at which the torque repeats with the joint's angle, best first, at most two."""
-    span = float(np.ptp(one.position))
-    if span <= 0:
-        return []
-    together = -(-len(one.torque) // 4096)
-    rows = slice(None, None, together)
-    turn = 2 * np.pi / span
-    # a line faster than the sensor resolves leaves nothing, whatever its spatial frequency
-    fastest = 0.5 / (together * one.period) / max(float(np.median(np.abs(one.velocity))), 1e-300) * 2 * np.pi
-    numbers = np.arange(turn, min(200 * turn, max(fastest, 4 * turn)), 0.4 * turn)
-    motion = _of_motion(one, 1)[rows]
-
-    def shares(at: FloatArray) -> FloatArray:
-        pairs = [one.seen(np.column_stack([np.sin(n * one.position), np.cos(n * one.position)]))[rows] for n in at]
-        return signal_features.line_shares(one.torque[rows], pairs, motion)
-
-    found = shares(numbers)
-    if len(found) < 5:
-        return []
-    clear = max(LINE_SHARE, LINE_CLEAR * float(np.median(found)))
-    inner = np.flatnonzero((found[1:-1] >= found[:-2]) & (found[1:-1] >= found[2:]) & (found[1:-1] > clear)) + 1
-    lines = []
-    for k in inner[np.argsort(-found[inner])][:LINES]:
-        near = numbers[k] + turn * np.linspace(-0.4, 0.4, 17)
-        sharper = shares(near)
-        at = int(np.argmax(sharper))
-        lines.append(Line(float(near[at]), float(sharper[at])))
-    return lines
-
-
-def sampling(one: MissingTorque) -> tuple[float, float] | None:
-    """Period and first moment at which a drive takes its command, where that would explain what a delay leaves."""
-    rest = one.beside(np.gradient(one.command)[:, None])
-    found = best_sampling(rest.torque, rest.command, rest.time, rest.seen)
-    return found[:2] if found is not None and found[2] >= TRAIN_SHARE else None
-
-
-def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
-    """Start (s since the first sample) and duration of the clearest pulse, or None."""
-    motion, shortest = _of_motion(one), max(round(SHORTEST_PULSE / one.period), 2)
-    first = signal_features.best_box(without(one.torque, motion), shortest)
-    if first is None:
-        return None
-    # what the motion explains is determined by the rest of the log, else it takes a part of the pulse
-    rest = without(one.torque, motion, by=first.outside(len(motion)))
-    box = signal_features.best_box(rest, shortest)
-    if box is None:
-        return None
-    outside = box.outside(len(rest))
-    others = rest[outside] - np.median(rest[outside])
-    noise = max(1.4826 * float(np.median(np.abs(others))), one.noise)
-    length = box.stop - box.start
-    if box.height**2 * length < CLEAR * noise**2 * max(min(signal_features.memory(others), length), 1.0):
-        return None
-    return float(one.time[box.start]), length * one.period
-
-
-def pulse_train(one: MissingTorque) -> Train | None:
-    """Equal pulses at regular intervals that are not the motion's own, or None."""
-    rest = without(one.torque, _of_motion(one))
-    period, share = signal_features.best_period(rest, one.time, SHORTEST_PERIOD)
-    if share < TRAIN_SHARE or _rhythm_of_motion(one, period):
-        return None
-    train = _upright(one, signal_features.best_train(rest, one.time, period))
-    return train if train.share >= TRAIN_SHARE else None
-
-
-def _upright(one: MissingTorque, train: Train) -> Train:
-    """The train or the gaps between its pulses: whichever leaves nothing where it is off.
-
-    Where a fitted constant torque has taken its share of both, the one that comes first.
-    """
-    gaps = Train(
-        start=(train.start + train.duration) % train.period,
-        duration=train.period - train.duration,
-        period=train.period,
-        height=-train.height,
-        share=train.share,
-    )
-    on = np.mod(one.time - train.start, train.period) < train.duration
-    if on.all() or not on.any():
-        return train
-    off, inside = abs(float(np.median(one.torque[~on]))), abs(float(np.median(one.torque[on])))
-    if abs(off - inside) < EVEN * abs(train.height):
-        return min(train, gaps, key=lambda t: t.start)
-    return train if off < inside else gaps
-
-
-def _rhythm_of_motion(one: MissingTorque, period: float) -> bool:
-    return signal_features.repetition(one.velocity, one.time, period) > OWN_RHYTHM
+"""Joints that are described."""
 
 
 def signature(study: Study, model: Model) -> dict[str, Any]:
@@ -251,25 +63,19 @@ def signature(study: Study, model: Model) -> dict[str, Any]:
     torques = missing_torques(study.train_problem(model), model.values, study.scales)
     if not torques:
         return {"summary": f"not characterised: {study.procedure.no_torque}", "joints": []}
-    loud = sorted((t for t in torques if t.chi2 >= LOUD), key=lambda t: -_blame(t))
+    loud = sorted((t for t in torques if t.chi2 >= LOUD), key=lambda t: -blame(t))
     if not loud:
         return {"summary": "no torque at any joint: positions are at their noise floor", "joints": []}
     # one episode a joint: the one that shows most
     chosen = list({t.joint: t for t in reversed(loud)}.values())[::-1]
-    total = sum(_blame(t) for t in chosen)
+    total = sum(blame(t) for t in chosen)
     entries: list[dict[str, Any]] = []
     for one in chosen[:DESCRIBED]:
-        share = _blame(one) / max(total, 1e-300)
+        share = blame(one) / max(total, 1e-300)
         if entries and share < 0.05:
             break
         entries.append({"joint": one.joint, "share": share, **_describe(one, torques)})
     return {"summary": "; ".join(e.pop("words") for e in entries), "joints": entries}
-
-
-def _blame(one: MissingTorque) -> float:
-    """Excess over the noise floor, as far as a torque at this joint, not at others, explains it."""
-    power = float(np.mean(one.torque**2))
-    return (one.chi2 - 1) * max(power - one.noise**2, 0.0) / max(power, 1e-300)
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,13 +135,13 @@ def _localised(one: MissingTorque) -> dict[str, float]:
 
 def _periodic(one: MissingTorque) -> dict[str, Any] | None:
     """How the missing torque repeats in time: itself, or only its size."""
-    rest = without(one.torque, _of_motion(one))
+    rest = without(one.torque, of_motion(one))
     # whether there is a torque rather than how large it is: a pulse depends on the load of its moment
     size = (np.abs(rest) > OUTLIER * 1.4826 * float(np.median(np.abs(rest)))).astype(float)
     options = []
     for signal, same_sign in ((rest, True), (size, False)):
         period, share = signal_features.best_period(signal, one.time, SHORTEST_PERIOD)
-        if share > 0 and not _rhythm_of_motion(one, period):
+        if share > 0 and not is_own_rhythm(one, period):
             options.append((share, same_sign, period, signal))
     if not options:
         return None
@@ -346,7 +152,7 @@ def _periodic(one: MissingTorque) -> dict[str, Any] | None:
     if share < TRAIN_SHARE:
         return None
     train = signal_features.best_train(signal, one.time, period)
-    train = _upright(one, train) if same_sign else train
+    train = upright(one, train) if same_sign else train
     on = np.mod(one.time - train.start, train.period) < train.duration
     inside = rest[on] if on.any() else rest
     return {
@@ -379,7 +185,7 @@ def _features(
     yield _Feature("position_and_direction", "the position and the direction of motion", sign[:, None] * patch)
     for other in torques:
         if other.episode == one.episode and other.joint != one.joint:
-            own = np.column_stack([_unit(q), of(other.position, 5)])
+            own = np.column_stack([scaled(q), of(other.position, 5)])
             yield _Feature(f"position:{other.joint}", f"the position of {other.joint}", own)
     if periodic is not None:
         phase = np.mod((one.time - periodic["start"]) / periodic["period"] + 0.25, 1.0)

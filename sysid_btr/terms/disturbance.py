@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
-from sysid_btr.terms.base import BatchModel, Kind, Parameter, Term
+from sysid_btr.terms.base import BatchModel, Kind, Term
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.law import Step, used_in_laws
 from sysid_btr.terms.scales import JointScale
@@ -74,24 +74,15 @@ class KnownTorque(Term):
 
 
 @dataclass(frozen=True)
-class ExternalDisturbance(Effect):
-    """Pushes from outside: a torque on a joint between two moments, once or again and again.
+class Push(Effect):
+    """Base: a torque on a joint whose course begins at some moment, which only the residual can propose.
 
-    Torque: a rectangular pulse, exact in the mean over each step.
+    Torque: the course times its amount, exact in the mean over each step.
     """
 
     name: ClassVar[str] = "external_disturbance"
     family: ClassVar[str] = "disturbance"
-    title: ClassVar[str] = "push from outside"
-    held: ClassVar[tuple[str, ...]] = ("start", "duration")
-    transient: ClassVar[bool] = True
     signed: ClassVar[bool] = True
-    kinds: ClassVar[tuple[Kind, ...]] = (
-        Kind("torque", "Nm", 0.0, -50.0, 50.0, 0.1),
-        Kind("start", "s", 0.0, 0.0, 1e5, 0.02),
-        Kind("duration", "s", 0.1, 0.001, 100.0, 0.02),
-    )
-    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("payload", "a push that is not repeated"),)
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
@@ -103,63 +94,104 @@ class ExternalDisturbance(Effect):
         return ()
 
     @classmethod
-    def probe_at(cls, scale: JointScale, start: float, duration: float) -> Probe:
-        """A probe at a time that the residual proposes."""
-        return ((0.1 * scale.torque_rms, start, duration),)
+    def probe_at(cls, scale: JointScale, *when: float) -> Probe:
+        """A probe whose course the residual proposes: all kinds but the amount."""
+        return ((0.1 * scale.torque_rms, *when),)
 
     def around(self, values: FloatArray) -> Self:
-        """The same with times bounded near a guess (parameters,), so that a fit can refine them."""
-        return replace(self, known=_near(self.parameters, values, len(self.kinds)))
+        """The same with a course bounded near a guess (parameters,), so that a fit can refine it.
 
-    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray:
+        A fit takes its finite differences as fractions of the bounds: within bounds of a whole log the start of a pulse
+        would be displaced by more than the pulse.
+        """
+        known, count = [], len(self.kinds)
+        for i, parameter in enumerate(self.parameters):
+            place, kind = divmod(i, count)
+            reach = self.reaches(*values[place * count + 1 : (place + 1) * count])[kind - 1] if kind else None
+            known.append(parameter if reach is None else parameter.near(float(values[i]), float(reach)))
+        return replace(self, known=tuple(known))
+
+    @classmethod
+    def reaches(cls, *when: float) -> tuple[float, ...]:
+        """How far from a guess a fit may look for each number of the course."""
+        raise NotImplementedError
+
+    @classmethod
+    def lasts(cls, *when: float) -> float:
+        """Seconds after which it is over."""
+        raise NotImplementedError
+
+    @classmethod
+    def impulse(cls, time: FloatArray, *when: FloatArray) -> FloatArray:
+        """Integral of the course until some moment, for an amount of 1."""
+        raise NotImplementedError
+
+    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
         torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
         for place, column in enumerate(batch.index.of(self.places)):
-            amount, start, duration = (values[:, place, k, None] for k in range(3))
-            overlap = np.minimum(time[:, 1:], start + duration) - np.maximum(time[:, :-1], start)
-            torque[:, :, column] += amount * np.maximum(overlap, 0.0) / batch.timestep
+            torque[:, :, column] += self.mean_torque(values[:, place], time)
         return torque
+
+    @classmethod
+    def mean_torque(cls, values: FloatArray, time: FloatArray) -> FloatArray:
+        """Mean torque over each step, (m, steps), of pushes (m, kinds) in steps between `time` (m or 1, steps + 1)."""
+        amount, *when = values.T[:, :, None]
+        return np.asarray(amount * np.diff(cls.impulse(time, *when), axis=1) / np.diff(time, axis=1))
 
 
 @dataclass(frozen=True)
-class ExternalDisturbanceTrain(Effect):
-    """The same push again and again.
+class ExternalDisturbance(Push):
+    """A push from outside: a constant torque on a joint between two moments."""
 
-    Torque: rectangular pulses, exact in the mean over each step.
-    """
+    title: ClassVar[str] = "push from outside"
+    held: ClassVar[tuple[str, ...]] = ("start", "duration")
+    transient: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("torque", "Nm", 0.0, -50.0, 50.0, 0.1),
+        Kind("start", "s", 0.0, 0.0, 1e5, 0.02),
+        Kind("duration", "s", 0.1, 0.001, 100.0, 0.02),
+    )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (("payload", "a push that is not repeated"),)
 
-    name: ClassVar[str] = "external_disturbance"
-    family: ClassVar[str] = "disturbance"
+    @classmethod
+    def reaches(cls, *when: float) -> tuple[float, ...]:
+        duration = when[1]
+        return max(0.5 * duration, 0.05), 0.7 * duration
+
+    @classmethod
+    def lasts(cls, *when: float) -> float:
+        return when[1]
+
+    @classmethod
+    def impulse(cls, time: FloatArray, *when: FloatArray) -> FloatArray:
+        start, duration = when
+        return np.asarray(np.minimum(np.maximum(time - start, 0.0), duration))
+
+
+@dataclass(frozen=True)
+class ExternalDisturbanceTrain(Push):
+    """The same push again and again."""
+
     variant: ClassVar[str] = "train"
     title: ClassVar[str] = "push from outside that comes again and again"
-    held: ClassVar[tuple[str, ...]] = ("start", "duration", "period")
-    signed: ClassVar[bool] = True
+    held: ClassVar[tuple[str, ...]] = (*ExternalDisturbance.held, "period")
     kinds: ClassVar[tuple[Kind, ...]] = (*ExternalDisturbance.kinds, Kind("period", "s", 1.0, 0.01, 1e4, 0.01))
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("command_delay", "a motion that does not repeat with the pushes"),
     )
 
     @classmethod
-    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        return (*ExternalDisturbance.sized(scale), cls.kinds[-1])
+    def reaches(cls, *when: float) -> tuple[float, ...]:
+        _, duration, period = when
+        return *ExternalDisturbance.reaches(*when[:2]), min(0.02 * period, 0.25 * duration)
 
     @classmethod
-    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
-        return ()
+    def lasts(cls, *when: float) -> float:
+        return when[1]
 
     @classmethod
-    def probe_at(cls, scale: JointScale, start: float, duration: float, period: float) -> Probe:
-        """A probe at times that the residual proposes."""
-        return ((0.1 * scale.torque_rms, start, duration, period),)
-
-    def around(self, values: FloatArray) -> Self:
-        """The same with times bounded near a guess (parameters,), so that a fit can refine them."""
-        return replace(self, known=_near(self.parameters, values, len(self.kinds)))
-
-    def applied_torque(self, batch: BatchModel, values: FloatArray, time: FloatArray) -> FloatArray | None:
-        torque = np.zeros((batch.size, time.shape[1] - 1, len(batch.index.joints)))
-        for place, column in enumerate(batch.index.of(self.places)):
-            torque[:, :, column] += pulses(values[:, place], time)
-        return torque
+    def impulse(cls, time: FloatArray, *when: FloatArray) -> FloatArray:
+        return np.asarray(time_in_pulses(time, *when))
 
 
 @dataclass(frozen=True)
@@ -190,14 +222,63 @@ class DriveDisturbanceTrain(ExternalDisturbanceTrain):
             step.motor_torque[j] += numbers[p, 0] * spent / step.timestep
 
 
-def pulses(values: FloatArray, time: FloatArray) -> FloatArray:
-    """Mean torque over each step, (m, steps), of trains (m, 4) of torque, start, duration, period.
+@dataclass(frozen=True)
+class RingingDisturbance(Push):
+    """A blow that rings: a torque on a joint that swings and dies away, as of an elastic structure that was struck.
 
-    `time` (m or 1, steps + 1) is that of the borders of the steps.
+    Torque: exp(-t / decay) sin(2 pi frequency t) from the blow on, the impulse response of a damped oscillator.
     """
-    amount, start, duration, period = (values[:, k, None] for k in range(4))
-    spent = time_in_pulses(time, start, duration, period)
-    return np.asarray(amount * np.diff(spent, axis=1) / np.diff(time, axis=1))
+
+    variant: ClassVar[str] = "ringing"
+    title: ClassVar[str] = "blow that rings"
+    held: ClassVar[tuple[str, ...]] = ("start", "frequency", "decay")
+    transient: ClassVar[bool] = True
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        *ExternalDisturbance.kinds[:2],
+        Kind("frequency", "1/s", 3.0, 0.01, 200.0, 0.05),
+        Kind("decay", "s", 0.5, 0.005, 100.0, 0.02),
+    )
+
+    @classmethod
+    def reaches(cls, *when: float) -> tuple[float, ...]:
+        _, frequency, decay = when[:3]
+        return 0.25 / frequency, min(0.3 * frequency, 0.5 / decay), 0.7 * decay
+
+    @classmethod
+    def lasts(cls, *when: float) -> float:
+        return 3.0 * when[2]  # to a twentieth
+
+    @classmethod
+    def impulse(cls, time: FloatArray, *when: FloatArray) -> FloatArray:
+        start, frequency, decay = when
+        rate = -1.0 / decay + 2j * np.pi * frequency
+        return np.asarray(((np.exp(rate * np.maximum(time - start, 0.0)) - 1.0) / rate).imag)
+
+
+@dataclass(frozen=True)
+class RingingDisturbanceTrain(RingingDisturbance):
+    """The same blow again and again; what earlier ones left of their ringing adds up."""
+
+    variant: ClassVar[str] = "ringing_train"
+    title: ClassVar[str] = "blow that rings and comes again and again"
+    held: ClassVar[tuple[str, ...]] = (*RingingDisturbance.held, "period")
+    transient: ClassVar[bool] = False
+    kinds: ClassVar[tuple[Kind, ...]] = (*RingingDisturbance.kinds, ExternalDisturbanceTrain.kinds[-1])
+
+    @classmethod
+    def reaches(cls, *when: float) -> tuple[float, ...]:
+        return *RingingDisturbance.reaches(*when), min(0.02 * when[3], 0.25 / when[1])
+
+    @classmethod
+    def impulse(cls, time: FloatArray, *when: FloatArray) -> FloatArray:
+        start, frequency, decay, period = when
+        rate = -1.0 / decay + 2j * np.pi * frequency
+        since = np.maximum(time - start, 0.0)
+        before = np.floor(since / period)
+        # what the blows so far began, each exp(rate t) since its own, is a geometric series
+        fade = np.exp(rate * period)
+        together = np.exp(rate * (since - before * period)) * (1.0 - fade ** (before + 1)) / (1.0 - fade)
+        return np.asarray(((together - (before + 1)) / rate).imag)
 
 
 @used_in_laws
@@ -207,19 +288,3 @@ def time_in_pulses(time: Any, start: Any, duration: Any, period: Any) -> Any:
     whole = np.floor(since / period)
     each = np.minimum(duration, period)
     return whole * each + np.minimum(since - whole * period, each)
-
-
-def _near(parameters: tuple[Parameter, ...], values: FloatArray, kinds: int) -> tuple[Parameter, ...]:
-    """Parameters whose bounds on times are as narrow as the guess of a pulse allows.
-
-    A fit takes its finite differences as fractions of the bounds: within bounds of a whole log the start of
-    a pulse would be displaced by more than the pulse.
-    """
-    result = []
-    for i, parameter in enumerate(parameters):
-        place, kind = divmod(i, kinds)
-        duration = float(values[place * kinds + 2])
-        value = float(values[i])
-        reach = (None, max(0.5 * duration, 0.05), 0.7 * duration, min(0.02 * value, 0.25 * duration))[kind]
-        result.append(parameter if reach is None else parameter.near(value, reach))
-    return tuple(result)

@@ -15,6 +15,8 @@ from sysid_btr.terms.disturbance import (
     DriveDisturbanceTrain,
     ExternalDisturbance,
     ExternalDisturbanceTrain,
+    RingingDisturbance,
+    RingingDisturbanceTrain,
 )
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FREE_FORMS, FreeGainOfAll, FreeGainStiffness
@@ -123,6 +125,8 @@ BUILT_IN: tuple[type[Term], ...] = (
     ExternalDisturbance,
     ExternalDisturbanceTrain,
     DriveDisturbanceTrain,
+    RingingDisturbance,
+    RingingDisturbanceTrain,
     *FREE_FORMS,
     GravityTilt,
     FootFriction,

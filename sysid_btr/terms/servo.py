@@ -267,7 +267,7 @@ class CommandDelaySampled(Effect):
         return ()
 
     @classmethod
-    def probe_at(cls, period: float, start: float) -> Probe:
+    def probe_at(cls, scale: JointScale, period: float, start: float) -> Probe:
         """A probe at moments that the residual proposes."""
         return ((period, start),)
 
