@@ -7,11 +7,12 @@ import pytest
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_together, form_hypotheses
-from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity
+from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, perturbations
 from sysid_btr.diagnosis.selection import STANDARD
 from sysid_btr.terms.free_form import FreeCurve, FreeFrictionSpeed, FreeTorquePeriodic, FreeTorquePosition
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.scales import JointScale, Scales
+from sysid_btr.terms.spring import JointSpring
 
 ROWS = 400
 JOINTS = ("shoulder", "elbow")
@@ -107,3 +108,15 @@ def test_curves_that_are_the_best_of_several_joints_are_one_hypothesis_with_the_
     assert one.gain == 1600.0
     np.testing.assert_array_equal(one.start, np.repeat([900.0, 700.0], len(FreeTorquePeriodic.kinds)))
     assert curves_together(found[2:3], STANDARD) == []
+
+
+def test_what_may_be_alike_everywhere_is_asked_at_joints_that_limbs_have_in_common() -> None:
+    """Over a base that moves, friction of all knees need not look like that of any one."""
+    legs = ("a", "b", "c")
+    joints = tuple(leg + part for leg in legs for part in ("hip", "knee"))
+    alike = (tuple(leg + "hip" for leg in legs), tuple(leg + "knee" for leg in legs))
+    scales = dict.fromkeys(joints, SCALES["elbow"])
+    asked = perturbations((CoulombFriction, JointSpring), {"joint": joints}, scales, alike)
+    together = {(q.effect, q.places) for q in asked if len(q.places) > 1}
+    assert together == {(CoulombFriction, places) for places in (joints, *alike)}
+    assert {q.places for q in asked if q.effect is JointSpring} == {(joint,) for joint in joints}

@@ -14,10 +14,11 @@ from sysid_btr.errors import LogError, ModelError
 from sysid_btr.identify.numerics import PAPER_TIMING, choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log
+from sysid_btr.models.ant import ant
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.emps import emps
 from sysid_btr.models.nao import FEET, STARRED, nao, nao_table1
-from sysid_btr.models.robot import Robot, joint_names, joint_ranges, servo_joints
+from sysid_btr.models.robot import Robot, alike_joints, joint_names, joint_ranges, servo_joints
 from sysid_btr.models.xl330 import TORQUE_PER_VOLT, xl330
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
@@ -331,3 +332,9 @@ def test_metadata_that_cannot_be_used_is_told(extra: dict[str, object]) -> None:
     log = make_log(np.arange(10) * 0.01, {"command.pendulum": np.zeros(10)}, extra=extra)
     with pytest.raises(LogError, match="metadata"):
         xl330().for_log(log)
+
+
+def test_limbs_of_one_kind_have_joints_in_common() -> None:
+    legs = [f"{side}{part}" for side in "LR" for part in "FMR"]
+    assert alike_joints(ant()) == tuple(tuple(leg + part for leg in legs) for part in ("Coxa", "Femur", "Tibia"))
+    assert alike_joints(nao()) == (), "two legs are not many"

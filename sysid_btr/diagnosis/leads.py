@@ -22,7 +22,7 @@ from sysid_btr.identify.missing_torque import missing_torques
 from sysid_btr.identify.projection import explained_by
 from sysid_btr.identify.refit import inflate, judge, shorten
 from sysid_btr.identify.study import Study
-from sysid_btr.models.robot import body_names, joint_names
+from sysid_btr.models.robot import alike_joints, body_names, joint_names
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.base import LINK_SUFFIX, TETHER_SUFFIX, Scope
 from sysid_btr.terms.effect import Effect
@@ -137,7 +137,7 @@ def _perturbations(state: State, library: Library, problem: ReplayProblem, resid
         scope: tuple(name for name in study.robot.names(scope) if not name.endswith(LINK_SUFFIX))
         for scope in get_args(Scope)
     }
-    asked: list[Perturbation] = perturbations(library, places, study.scales)
+    asked: list[Perturbation] = perturbations(library, places, study.scales, alike_joints(study.robot))
     asked += proposals(study, problem, problem.start, residual[: problem.count], library)
     terms = state.fitted.model.terms
     taken = _with_parts_of_terms(study)

@@ -108,21 +108,31 @@ class Sensitivity:
 
 
 def perturbations(
-    effects: Sequence[type[Effect]], places: dict[str, tuple[str, ...]], scales: Scales
+    effects: Sequence[type[Effect]],
+    places: dict[str, tuple[str, ...]],
+    scales: Scales,
+    alike: Sequence[tuple[str, ...]] = (),
 ) -> list[Perturbation]:
-    """All effects at all places of their scope, and alike at all places at once, at all working points."""
+    """All effects at all places of their scope, and alike at all places at once, at all working points.
+
+    `alike` are groups of places that have much in common, at which an effect may well be alike too: where limbs push
+    each other over a base that moves, what happens in all of them is not the sum of what each would show.
+    """
     asked = [
         Perturbation(effect, (place,), probe)
         for effect in effects
         for place in places[effect.scope]
         for probe in effect.probes(scale_at(scales, place))
     ]
-    asked += [
-        Perturbation(effect, places[effect.scope], probe)
-        for effect in effects
-        if effect.everywhere and len(places[effect.scope]) > 1
-        for probe in effect.probes(middle_scale([scales[p] for p in places[effect.scope]]))
-    ]
+    for effect in effects:
+        own = places[effect.scope]
+        groups = [own, *(g for g in alike if set(g) < set(own))] if effect.everywhere else []
+        asked += [
+            Perturbation(effect, group, probe)
+            for group in groups
+            if len(group) > 1
+            for probe in effect.probes(middle_scale([scales[p] for p in group]))
+        ]
     return asked
 
 

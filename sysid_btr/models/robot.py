@@ -173,6 +173,21 @@ def joint_names(robot: Robot) -> tuple[str, ...]:
     return tuple(model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in SINGLE)
 
 
+def alike_joints(robot: Robot) -> tuple[tuple[str, ...], ...]:
+    """Joints that three or more limbs have in common: as far down a tree, with as heavy links and rotors."""
+    model, groups = robot.model, dict[tuple[float, ...], list[str]]()
+    depth = np.zeros(model.nbody, dtype=np.int64)
+    for body in range(1, model.nbody):
+        depth[body] = depth[model.body_parentid[body]] + model.body_jntnum[body]
+    for name in joint_names(robot):
+        joint = model.joint(name).id
+        body, dof = model.jnt_bodyid[joint], model.jnt_dofadr[joint]
+        numbers = (model.body_mass[body], model.body_subtreemass[body], model.dof_armature[dof])
+        key = (depth[body], model.jnt_type[joint], *(float(f"{x:.3g}") for x in numbers))
+        groups.setdefault(key, []).append(name)
+    return tuple(tuple(group) for group in groups.values() if len(group) > 2)
+
+
 def joint_ranges(robot: Robot) -> dict[str, tuple[float, float]]:
     """Joint limits where the model states them, rad or m."""
     model = robot.model
