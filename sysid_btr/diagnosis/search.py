@@ -76,8 +76,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
         if recorded is not None:
             state = recorded
             continue
-        worthy = [t for t in trials if _is_worthy(rules, state, t)]
-        winner = choose(rules, now, worthy)
+        winner = _best(state, trials, rules)
         floating = state.study.procedure.leaves_ground_error
         explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
         likely = not state.study.procedure.wanders or (winner is not None and is_likely(rules, now, winner, trials))
@@ -120,23 +119,38 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
     return bool(weights([now, then], then, [0, trial.hypothesis.complexity])[1] >= rules.evident)
 
 
+def _best(state: State, trials: Sequence[Trial], rules: Selection) -> Trial | None:
+    return choose(rules, state.fitted, [t for t in trials if _is_worthy(rules, state, t)])
+
+
 def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:
-    """Refit the hypotheses of a scan, the most promising first, while they may matter."""
+    """Refit the hypotheses of a scan, the most promising first, while they may matter.
+
+    Curves for which there is a law come last, and only where the data want none of the laws.
+    """
     say("scan for what lowers the held-out chi2")
     hypotheses, answers = leading_hypotheses(state, library, rules)
     state = state.spent(answers)
     trials: list[Trial] = []
+    waiting: list[Hypothesis] = []
+
+    def tried(hypothesis: Hypothesis) -> State:
+        trial = attempt(state.study, state.fitted.model, hypothesis, rules)
+        trials.append(trial)
+        say(f"with {hypothesis} held-out chi2 {trial.fitted.holdout:.4g}")
+        return state.spent(trial.fitted.evaluations)
+
     for hypothesis in hypotheses:
         if is_superfluous(rules, hypothesis, trials) or is_outdone(rules, hypothesis, trials):
             continue
         if is_hopeless(rules, hypothesis, hypotheses[0], len(trials)):
             continue
         if has_law(rules, hypothesis, state.fitted, trials):
+            waiting.append(hypothesis)
             continue
-        trial = attempt(state.study, state.fitted.model, hypothesis, rules)
-        trials.append(trial)
-        say(f"with {hypothesis} held-out chi2 {trial.fitted.holdout:.4g}")
-        state = state.spent(trial.fitted.evaluations)
+        state = tried(hypothesis)
+    while waiting and _best(state, trials, rules) is None:
+        state = tried(waiting.pop(0))
     return state, trials
 
 
