@@ -79,7 +79,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
         winner = _best(state, trials, rules)
         floating = state.study.procedure.leaves_ground_error
         explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
-        likely = not state.study.procedure.wanders or (winner is not None and is_likely(rules, now, winner, trials))
+        likely = _is_likely(state, winner, trials, rules)
         if explained and not likely:
             winner = None
         told = candidates_of(rules, now, trials, winner, number)
@@ -123,10 +123,17 @@ def _best(state: State, trials: Sequence[Trial], rules: Selection) -> Trial | No
     return choose(rules, state.fitted, [t for t in trials if _is_worthy(rules, state, t)])
 
 
+def _is_likely(state: State, winner: Trial | None, trials: Sequence[Trial], rules: Selection) -> bool:
+    """Whether a round has a winner that is what it is called; where nothing wanders, what wins is."""
+    if winner is None:
+        return False
+    return not state.study.procedure.wanders or is_likely(rules, state.fitted, winner, trials)
+
+
 def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:
     """Refit the hypotheses of a scan, the most promising first, while they may matter.
 
-    Curves for which there is a law come last, and only where the data want none of the laws.
+    Curves for which there is a law come last, and only where no law is likely.
     """
     say("scan for what lowers the held-out chi2")
     hypotheses, answers = leading_hypotheses(state, library, rules)
@@ -149,7 +156,7 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
             waiting.append(hypothesis)
             continue
         state = tried(hypothesis)
-    while waiting and _best(state, trials, rules) is None:
+    while waiting and not _is_likely(state, _best(state, trials, rules), trials, rules):
         state = tried(waiting.pop(0))
     return state, trials
 
