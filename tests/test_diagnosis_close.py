@@ -38,7 +38,7 @@ from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ConstantForce, RingingDisturbance, RingingDisturbanceTrain
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.free_form import FreeTorquePeriodic
+from sysid_btr.terms.free_form import FreeTorquePeriodic, FreeTorquePosition
 from sysid_btr.terms.friction import (
     CoulombFriction,
     PreslidingFriction,
@@ -410,6 +410,27 @@ def test_a_wave_that_no_law_has_is_learnt_as_one() -> None:
     frequency = next(p for p in effect.parameters if "frequency" in p.name)
     assert frequency.value == pytest.approx(3.7, abs=0.01)
     assert "periodic in time" in effect.sentence
+    assert over_floor(found) <= 1.1
+
+
+def test_a_spring_that_hardens_is_one_curve_and_not_several_laws() -> None:
+    """A stop and a straight spring take up most of it, and their error looks like cogging."""
+    robot, log = toys.leg(), motion(8.0)
+    study = make_study(robot, [log], numerics=toys.FINE)
+    spring = FreeTorquePosition.at(KNEE, study.scales)
+    angle = np.linspace(*spring.ranges[0], 200)
+    cube = np.linalg.lstsq(spring.modes_of("knee", angle), -8.0 * (angle + 0.2) ** 3, rcond=None)[0]
+    terms = (*study.declare(("mass:knee", "kp:*=shared")), spring)
+    shown = toys.run(robot, log, terms, [TRUE_MASS, TRUE_KP, *cube], OTHERWISE).position[0]
+    noise = np.random.default_rng(0).normal(0, 5e-4, shown.shape)
+    positions = {f"position.{j}": shown[:, i] + noise[:, i] for i, j in enumerate(toys.LEG_JOINTS)}
+    sought = ("joint_spring", "joint_stop", "cogging", "free_torque")
+    log = replace(log, channels={**log.channels, **positions})
+    found = close(make_study(robot, [log]), TOY_FIT, effects=sought)
+    effect = only_effect(found)
+    assert (effect.effect, effect.family, effect.where) == ("free_torque", "spring", KNEE), found.message
+    assert found.verdict == "explained", found.message
+    assert any("joint_stop at knee" in step.removed for step in found.steps)
     assert over_floor(found) <= 1.1
 
 

@@ -12,6 +12,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.joining import as_curves
 from sysid_btr.diagnosis.leads import Library
 from sysid_btr.diagnosis.selection import (
     Selection,
@@ -36,11 +37,12 @@ SETTLED = 0.01
 
 def eliminate(state: State, library: Library, rules: Selection, progress: Progress) -> State:
     """The model with only those effects that data want, at the optimum and with intervals."""
-    state, removed = _prune(state, rules)
-    if removed:
-        state = state.step(removed=removed)
+    state = _pruned(state, rules)
     if not state.effects:
         return state
+    joined = as_curves(state, library, rules)
+    # what took up the errors of their form goes with them
+    state = state if joined is state else _pruned(joined, rules)
     progress(done=state.replays, total=None, best=nan, note="each effect against what else it may be")
     state = _merged(exchange(state, library, rules), rules)
     for _ in range(state.study.procedure.last_turns):
@@ -89,8 +91,8 @@ def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[T
     return trial, spent
 
 
-def _prune(state: State, rules: Selection) -> tuple[State, list[str]]:
-    """Drop effects, and then locations of effects, that were in demand only until a later effect was found."""
+def _pruned(state: State, rules: Selection) -> State:
+    """The state without effects, and then locations of effects, in demand only until a later effect was found."""
     removed: list[str] = []
     found = state.effects if len(state.effects) > 1 else ()
     for effect in found[:-1]:
@@ -104,7 +106,7 @@ def _prune(state: State, rules: Selection) -> tuple[State, list[str]]:
         state, dropped = _at_fewer_locations(state, effect, rules)
         if dropped:
             removed.append(f"{effect.name} at {', '.join(dropped)}")
-    return state, removed
+    return state.step(removed=removed) if removed else state
 
 
 def _at_fewer_locations(state: State, effect: Effect, rules: Selection) -> tuple[State, tuple[str, ...]]:

@@ -42,7 +42,7 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
     began = perf_counter()
     found, residuals = _scan(state, [e for e in library if e not in FREE_FORMS], rules)
     hypotheses = form_hypotheses(found, residuals, state.study.scales, rules)
-    hypotheses += _curves(state.study, state.fitted.model, library, rules)
+    hypotheses += curves_of(state.study, state.fitted.model, library, rules)
     if study.journal is not None:
         arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
         seconds = study.journal.seconds + perf_counter() - began
@@ -50,7 +50,7 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
     return hypotheses, len(found)
 
 
-def _curves(study: Study, model: Model, library: Library, rules: Selection) -> list[Hypothesis]:
+def curves_of(study: Study, model: Model, library: Library, rules: Selection) -> list[Hypothesis]:
     """Of which variable what a model leaves is a smooth function: tried last, where no law says it more simply."""
     asked = set(library) & set(FREE_FORMS)
     if not asked:
@@ -83,7 +83,7 @@ def replacements(state: State, library: Library, parts: Sequence[IntArray], rule
         laws = [h for h in form_hypotheses(own, len(residual), study.scales, rules) if h.gain >= least]
         bare = model.values.copy()
         bare[part] = model.terms.nominal[part]
-        result.append([*laws, *_curves(study, model.at(bare), library, rules)[:1]])
+        result.append([*laws, *curves_of(study, model.at(bare), library, rules)[:1]])
     return result
 
 

@@ -1,0 +1,61 @@
+"""Several laws of one family at a joint, of which a curve may say all at once.
+
+Laws are added one at a time, and the next takes up what the form of the one before leaves: a spring that hardens is a
+stop, a spring beside it, and more beside these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import reduce
+
+from sysid_btr.diagnosis.evidence import Evidence
+from sysid_btr.diagnosis.leads import Library, curves_of
+from sysid_btr.diagnosis.selection import Selection, at_floor
+from sysid_btr.diagnosis.state import State
+from sysid_btr.diagnosis.trials import attempt
+from sysid_btr.terms.effect import Effect, family_of
+from sysid_btr.terms.free_form import FREE_FORMS
+
+
+def as_curves(state: State, library: Library, rules: Selection) -> State:
+    """The state with a curve in the place of several laws of its family at a joint, where it explains more than they.
+
+    Parameters
+    ----------
+    state : with effects.
+    library : effects that may be named.
+    """
+    if state.study.procedure.costly:
+        return state
+    for laws in _together(state):
+        if not at_floor(rules, state.fitted):
+            state = _as_curve(state, laws, library, rules)
+    return state
+
+
+def _together(state: State) -> list[tuple[Effect, ...]]:
+    """Laws that are of one family, at one joint and at no other."""
+    groups: dict[tuple[str, tuple[str, ...]], list[Effect]] = {}
+    for effect in state.effects:
+        if type(effect) not in FREE_FORMS and len(effect.places) == 1:
+            groups.setdefault((family_of(type(effect)), effect.places), []).append(effect)
+    return [tuple(laws) for laws in groups.values() if len(laws) > 1]
+
+
+def _as_curve(state: State, laws: tuple[Effect, ...], library: Library, rules: Selection) -> State:
+    family, places = family_of(type(laws[0])), laws[0].places
+    bare = state.fitted.model.without(*laws)
+    found = curves_of(state.study, bare, library, rules)
+    curve = next((h for h in found if family_of(h.effect) == family and h.places == places), None)
+    if curve is None or not bare.terms.admit(curve.effect, places):
+        return state
+    trial = attempt(state.study, bare, curve, rules)
+    state = state.spent(trial.fitted.evaluations)
+    if not trial.fitted.misfit + rules.simpler < state.fitted.misfit:
+        return state
+    known = list(zip(state.effects, state.evidence, strict=True))
+    own = reduce(Evidence.joined, (evidence for effect, evidence in known if effect in laws))
+    staying = tuple(evidence for effect, evidence in known if effect not in laws)
+    state = replace(state, fitted=trial.fitted, evidence=(*staying, own))
+    return state.step(added=(str(curve),), removed=[f"{law.name} at {', '.join(places)}" for law in laws])
