@@ -43,7 +43,7 @@ from sysid_btr.terms.friction import (
     CoulombFriction,
     LoadFriction,
     LoadFrictionLarger,
-    LoadFrictionQuadratic,
+    LoadFrictionPower,
     LoadFrictionStribeck,
     PreslidingFriction,
     QuadraticDamping,
@@ -454,11 +454,18 @@ def test_friction_of_the_larger_load_holds_more_where_the_weight_is_the_larger()
     assert np.abs(fallen[LoadFrictionLarger] - free).max() > 0.1
 
 
-def test_quadratic_load_friction_is_what_linear_is_at_one_load() -> None:
-    """Stuck at the servo's torque T, c T^2 holds as much as (c T) T."""
-    q = rest(LoadFrictionQuadratic, [0.2])
-    servo = KP * (COMMAND - q)
-    assert 0.02 < abs(servo - gravity(q)) <= 0.2 * servo**2 * 1.001
+@pytest.mark.parametrize("exponent", [0.5, 2 / 3, 2.0])
+def test_friction_by_a_power_of_the_load_holds_that_much(exponent: float) -> None:
+    q = rest(LoadFrictionPower, [0.2, exponent])
+    servo = abs(KP * (COMMAND - q))
+    assert 0.02 < abs(servo - abs(gravity(q))) <= 0.2 * servo**exponent * 1.001
+
+
+def test_friction_by_the_first_power_of_the_load_is_that_per_unit_of_load() -> None:
+    log = swing()
+    ratio = position(pendulum(), log, [at_arm(LoadFriction)], [0.2])
+    power = position(pendulum(), log, [at_arm(LoadFrictionPower)], [0.2, 1.0])
+    np.testing.assert_allclose(power, ratio, atol=1e-9)
 
 
 def test_load_friction_that_falls_with_speed_is_plain_without_its_falling_part() -> None:

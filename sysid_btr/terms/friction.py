@@ -275,23 +275,39 @@ class LoadFrictionLarger(LoadFriction):
 
 
 @dataclass(frozen=True)
-class LoadFrictionQuadratic(LoadFriction):
-    """Law: friction follows the square of the servo's torque: a gear is less efficient, the harder it is driven."""
+class LoadFrictionPower(LoadFriction):
+    """Friction that grows with a power of the load, as at contacts that flatten under it.
 
-    title: ClassVar[str] = "friction per unit of squared load"
-    variant: ClassVar[str] = "quadratic"
-    label: ClassVar[str] = "load_friction.quadratic"
-    kinds: ClassVar[tuple[Kind, ...]] = (Kind("curvature", "1/Nm", 0.0, 0.0, 1.0, 0.1),)
+    Two thirds for a sphere on a plane (Bowden and Tabor 1950, "The Friction and Lubrication of Solids"); two where a
+    gear is less efficient, the harder it is driven.
+
+    Law: torque |T|^exponent, with T the servo's torque in Nm at the middle of each step.
+    """
+
+    title: ClassVar[str] = "friction at a load of 1 Nm that grows with a power of it"
+    variant: ClassVar[str] = "power"
+    label: ClassVar[str] = "load_friction.power"
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.1),
+        Kind("exponent", "1", 1.0, 0.2, 3.0, 0.1),
+    )
+    held: ClassVar[tuple[str, ...]] = ("exponent",)
+    includes: ClassVar[tuple[str, ...]] = ("load_friction",)
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        size = 1 / scale.counter_peak
-        return (Kind("curvature", "1/Nm", 0.0, 0.0, 2 * size, 0.1 * size),)
+        exponent = cls.kinds[1]
+        most = scale.counter_peak * max(1.0, scale.torque_rms**-exponent.upper)
+        return (Kind("torque", "Nm", 0.0, 0.0, most, 0.08 * scale.torque_rms), exponent)
+
+    @classmethod
+    def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
+        return tuple(((0.16 * scale.torque_rms ** (1 - exponent), exponent),) for exponent in (0.5, 2.0))
 
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
         for p, j in enumerate(places):
-            step.friction[j] += numbers[p, 0] * drive(step, j) ** 2
+            step.friction[j] += numbers[p, 0] * abs(drive(step, j)) ** numbers[p, 1]
 
 
 @dataclass(frozen=True)
