@@ -238,6 +238,9 @@ class RingingDisturbance(Push):
         Kind("frequency", "1/s", 3.0, 0.01, 200.0, 0.05),
         Kind("decay", "s", 0.5, 0.005, 100.0, 0.02),
     )
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("joint_compliance", "blows that do not come with jerks of the motion itself"),
+    )
 
     @classmethod
     def reaches(cls, *when: float) -> tuple[float, ...]:
