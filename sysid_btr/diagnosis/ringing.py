@@ -24,8 +24,8 @@ SLOWEST, FASTEST, FINER = 1.0, 25.0, 1.15
 """Hz that are tried, and the ratio of neighbours."""
 DECAYS = (0.1, 0.2, 0.4, 0.8)
 """Seconds that are tried."""
-SWINGS = 0.4
-"""Periods within the decay below which nothing rings: that is a push."""
+SWINGS = 0.6
+"""Periods within the decay below which nothing rings, as of an oscillator whose quality is 2: that is a push."""
 LASTS = 5.0
 """Decays after which a ring is over."""
 APART = 2.0
@@ -140,7 +140,9 @@ def _explained(one: MissingTorque, effect: type[Push], when: tuple[float, ...]) 
 
 
 def _stands_out(one: MissingTorque, effect: type[Push], blow: Blow, pushed: float) -> bool:
-    """Whether a ring explains more than a push or a wave, and than noise of the colour of what it leaves."""
+    """Whether a blow rings and explains more than a push, a wave, and noise of the colour of what it leaves."""
+    if blow.when[1] * blow.when[2] < SWINGS:
+        return False
     angle = 2 * np.pi * blow.when[1] * one.time
     wave = orthonormal(one.seen(np.column_stack([np.sin(angle), np.cos(angle)])))
     if blow.explained <= max(pushed, float(np.sum((wave.T @ one.torque) ** 2))):
