@@ -138,11 +138,11 @@ class Selection:
     """A simpler hypothesis wins if its misfit is within this of the best one's: 6 % of chi2 in one column.
     Judgement."""
     law: float = 0.5
-    """Fraction of what a curve that is learnt explains, from which a law of another family at its place comes first:
-    most of it. The law says more, and a curve can still take up the rest. Judgement."""
-    law_of_family: float = 0.9
-    """The same for a law of the curve's own family, nearly all of it: a line explains 84 % of a cube, pulses 81 % of a
-    sine, and what they leave asks for others beside."""
+    """Fraction of what a curve that is learnt explains, from which a law at its place comes first: most of it. The law
+    says more, and a curve can still take up the rest. Judgement."""
+    law_if_periodic: float = 0.9
+    """The same for a curve that is periodic in time and a law of its family, nearly all of it: pulses at its frequency
+    explain 81 % of a sine, and what they leave asks for others beside. Judgement."""
     rival: float = 0.15
     """A rival whose misfit is within this of the winner's is confused with it, unless a paired test decides.
     Judgement."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,31 +73,28 @@ def is_outdone(rules: Selection, hypothesis: Hypothesis, trials: Sequence[Trial]
 
 
 def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Sequence[Trial]) -> bool:
-    """Whether a curve is not needed yet: a law there explains much of what it promises, and harms nothing."""
+    """Whether a curve is not needed yet: a law there explains a good part of what it promises, and harms nothing."""
     if hypothesis.effect not in FREE_FORMS:
         return False
+    laws, enough = _laws_beside(rules, hypothesis, trials)
     return any(
         float(before.train_cells.sum() - t.fitted.train_cells.sum()) >= enough * hypothesis.gain
         and t.fitted.holdout < (1 + rules.transient_harm) * before.holdout
-        for t, enough in _laws_beside(rules, hypothesis, trials)
+        for t in laws
     )
 
 
-def _laws_beside(rules: Selection, curve: Hypothesis, trials: Sequence[Trial]) -> Iterator[tuple[Trial, float]]:
+def _laws_beside(rules: Selection, curve: Hypothesis, trials: Sequence[Trial]) -> tuple[list[Trial], float]:
     """Of several trials those of laws that go before a curve, and the fraction of what it explains that they must.
 
     Functions of a robot's state resemble one another along a motion; what is periodic in time resembles no law of
     another family.
     """
-    periodic = issubclass(curve.effect, FreeCurve) and curve.effect.periodic
-    for trial in trials:
-        law = trial.hypothesis.effect
-        if law in FREE_FORMS or not set(curve.places) & set(trial.hypothesis.places):
-            continue
-        if family_of(law) == family_of(curve.effect):
-            yield trial, rules.law_of_family
-        elif not periodic:
-            yield trial, rules.law
+    places = set(curve.places)
+    laws = [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
+    if issubclass(curve.effect, FreeCurve) and curve.effect.periodic:
+        return [t for t in laws if family_of(t.hypothesis.effect) == family_of(curve.effect)], rules.law_if_periodic
+    return laws, rules.law
 
 
 def is_hopeless(rules: Selection, hypothesis: Hypothesis, best: Hypothesis, tried: int) -> bool:
@@ -155,9 +152,9 @@ def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner
     """Instead of a curve, a law at its place that explains a good part of the same: the curve may follow it."""
     if winner.hypothesis.effect not in FREE_FORMS:
         return winner
+    laws, enough = _laws_beside(rules, winner.hypothesis, trials)
     gain = before.holdout - winner.fitted.holdout
-    beside = _laws_beside(rules, winner.hypothesis, trials)
-    laws = [t for t, enough in beside if before.holdout - t.fitted.holdout >= enough * gain]
+    laws = [t for t in laws if before.holdout - t.fitted.holdout >= enough * gain]
     return _simplest(rules, laws) if laws else winner
 
 
