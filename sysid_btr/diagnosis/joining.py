@@ -14,12 +14,13 @@ from sysid_btr.diagnosis.leads import Library, curves_of
 from sysid_btr.diagnosis.selection import Selection, at_floor
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import attempt
+from sysid_btr.identify.refit import Fitted
 from sysid_btr.terms.effect import Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 
 
 def as_curves(state: State, library: Library, rules: Selection) -> State:
-    """The state with a curve in the place of several laws of its family at a joint, where it explains more than they.
+    """The state with a curve in the place of several laws of its family at a joint, of whose error it leaves little.
 
     Parameters
     ----------
@@ -52,10 +53,16 @@ def _as_curve(state: State, laws: tuple[Effect, ...], library: Library, rules: S
         return state
     trial = attempt(state.study, bare, curve, rules)
     state = state.spent(trial.fitted.evaluations)
-    if not trial.fitted.misfit + rules.simpler < state.fitted.misfit:
+    if not _leaves_little(trial.fitted, state.fitted, rules):
         return state
     known = list(zip(state.effects, state.evidence, strict=True))
     own = reduce(Evidence.joined, (evidence for effect, evidence in known if effect in laws))
     staying = tuple(evidence for effect, evidence in known if effect not in laws)
     state = replace(state, fitted=trial.fitted, evidence=(*staying, own))
     return state.step(added=(str(curve),), removed=[f"{law.name} at {', '.join(places)}" for law in laws])
+
+
+def _leaves_little(curve: Fitted, laws: Fitted, rules: Selection) -> bool:
+    """Whether a curve explains most of what laws leave above the noise, fitted and held out."""
+    parts = ((curve.train, laws.train), (curve.holdout, laws.holdout))
+    return all(after - 1 <= rules.joins * (before - 1) for after, before in parts)

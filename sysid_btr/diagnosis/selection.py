@@ -143,6 +143,9 @@ class Selection:
     law_if_periodic: float = 0.9
     """The same for a curve that is periodic in time and a law of its family, nearly all of it: pulses at its frequency
     explain 81 % of a sine, and what they leave asks for others beside. Judgement."""
+    joins: float = 0.5
+    """Fraction of what several laws of a family leave at a joint that a curve in their place may leave at most. A cube
+    as a stop and a line: 0.1 (toy leg); the friction of a real axis as dry and viscous: 0.95 (EMPS). Judgement."""
     rival: float = 0.15
     """A rival whose misfit is within this of the winner's is confused with it, unless a paired test decides.
     Judgement."""
