@@ -100,23 +100,27 @@ def single_pulse(one: MissingTorque) -> tuple[float, float] | None:
     box = signal_features.best_box(rest, shortest)
     if box is None:
         return None
-    outside = box.outside(len(rest))
-    others = rest[outside] - np.median(rest[outside])
-    noise = max(1.4826 * float(np.median(np.abs(others))), one.noise)
     length = box.stop - box.start
-    if box.height**2 * length < CLEAR * noise**2 * max(min(signal_features.memory(others), length), 1.0):
+    if not stands_out(one, box.height**2 * length, rest[box.outside(len(rest))], length):
         return None
     return float(one.time[box.start]), length * one.period
 
 
-def pulse_train(one: MissingTorque) -> Train | None:
-    """Equal pulses at regular intervals that are not the motion's own, or None."""
+def stands_out(one: MissingTorque, explained: float, rest: FloatArray, length: float) -> bool:
+    """Whether an event of so many samples explains far more, in squares, than noise of the colour of the rest would."""
+    others = rest - np.median(rest)
+    noise = max(1.4826 * float(np.median(np.abs(others))), one.noise)
+    return bool(explained >= CLEAR * noise**2 * max(min(signal_features.memory(others), length), 1.0))
+
+
+def pulse_train(one: MissingTorque) -> tuple[float, float, float] | None:
+    """Start, duration and period of equal pulses at regular intervals that are not the motion's own, or None."""
     rest = without(one.torque, of_motion(one))
     period, share = signal_features.best_period(rest, one.time, SHORTEST_PERIOD)
     if share < TRAIN_SHARE or is_own_rhythm(one, period):
         return None
     train = upright(one, signal_features.best_train(rest, one.time, period))
-    return train if train.share >= TRAIN_SHARE else None
+    return (train.start, train.duration, train.period) if train.share >= TRAIN_SHARE else None
 
 
 def upright(one: MissingTorque, train: Train) -> Train:

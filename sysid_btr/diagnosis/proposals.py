@@ -87,7 +87,7 @@ def _pulses(one: MissingTorque, scale: JointScale) -> Found:
     if pulse is not None:
         yield ExternalDisturbance, ExternalDisturbance.probe_at(scale, *pulse)
     if train is not None:
-        probe = ExternalDisturbanceTrain.probe_at(scale, train.start, train.duration, train.period)
+        probe = ExternalDisturbanceTrain.probe_at(scale, *train)
         yield from ((ExternalDisturbanceTrain, probe), (DriveDisturbanceTrain, probe))
 
 

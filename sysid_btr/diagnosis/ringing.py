@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis import signal_features
-from sysid_btr.diagnosis.patterns import CLEAR, SHORTEST_PERIOD, of_motion, pulse_train, single_pulse
+from sysid_btr.diagnosis.patterns import SHORTEST_PERIOD, of_motion, pulse_train, single_pulse, stands_out
 from sysid_btr.identify.missing_torque import MissingTorque
 from sysid_btr.identify.projection import orthonormal
 from sysid_btr.terms.disturbance import ExternalDisturbance, ExternalDisturbanceTrain, Push
@@ -50,19 +49,16 @@ def blows(one: MissingTorque) -> tuple[Blow | None, Blow | None]:
         return None, None
     frequency, decay, answer = guess
     first = int(np.argmax(np.abs(answer)))
-    once = _refined(beside, Ringing, (float(one.time[first]), frequency, decay))
+    once = _ring(beside, Ringing, (float(one.time[first]), frequency, decay))
     again: Blow | None = None
     comb = _comb(answer, max(round(max(SHORTEST_PERIOD, APART * decay) / one.period), 2))
     if comb is not None and comb[2] >= AGAIN * float(np.max(answer**2)):
         start, period, _ = comb
-        again = _refined(beside, RingingTrain, (float(one.time[start]), frequency, decay, period * one.period))
-    pulse, train = single_pulse(one), pulse_train(one)
-    pushed = 0.0 if pulse is None else _explained(beside, ExternalDisturbance, pulse)
-    pulses = () if train is None else (train.start, train.duration, train.period)
-    pushed_again = _explained(beside, ExternalDisturbanceTrain, pulses) if pulses else 0.0
+        again = _ring(beside, RingingTrain, (float(one.time[start]), frequency, decay, period * one.period))
+    # plain pushes are sought last: that takes longest, and few torques ring
     return (
-        once if _stands_out(beside, Ringing, once, pushed) else None,
-        again if again and _stands_out(beside, RingingTrain, again, pushed_again) else None,
+        once and _unless_pushed(beside, once, ExternalDisturbance, single_pulse(one)),
+        again and _unless_pushed(beside, again, ExternalDisturbanceTrain, pulse_train(one)),
     )
 
 
@@ -107,8 +103,8 @@ def _comb(answer: FloatArray, least: int) -> tuple[int, int, float] | None:
     return best
 
 
-def _refined(one: MissingTorque, effect: type[Push], guess: tuple[float, ...]) -> Blow:
-    """The numbers near a guess that explain most."""
+def _ring(one: MissingTorque, effect: type[Push], guess: tuple[float, ...]) -> Blow | None:
+    """A blow near a guess, as it explains most; None if it does not ring, a wave does as well, or noise nearly so."""
     from scipy.optimize import least_squares
 
     step = np.full(len(guess), 1e-3)
@@ -123,7 +119,18 @@ def _refined(one: MissingTorque, effect: type[Push], guess: tuple[float, ...]) -
         return one.torque - shown * (shown @ one.torque)
 
     found = least_squares(left, np.zeros(len(guess)), bounds=(low, high), diff_step=step, max_nfev=30)
-    return Blow(numbers(found.x), _explained(one, effect, numbers(found.x)))
+    blow = Blow(numbers(found.x), _explained(one, effect, numbers(found.x)))
+    _, frequency, decay = blow.when[:3]
+    angle = 2 * np.pi * frequency * one.time
+    wave = orthonormal(one.seen(np.column_stack([np.sin(angle), np.cos(angle)])))
+    rings = frequency * decay >= SWINGS and blow.explained > float(np.sum((wave.T @ one.torque) ** 2))
+    clear = rings and stands_out(one, blow.explained, left(found.x), LASTS * decay / one.period)
+    return blow if clear else None
+
+
+def _unless_pushed(one: MissingTorque, blow: Blow, effect: type[Push], push: tuple[float, ...] | None) -> Blow | None:
+    """A blow, unless a plain push explains as much."""
+    return None if push is not None and _explained(one, effect, push) >= blow.explained else blow
 
 
 def _shown(one: MissingTorque, effect: type[Push], when: tuple[float, ...]) -> FloatArray:
@@ -137,18 +144,3 @@ def _shown(one: MissingTorque, effect: type[Push], when: tuple[float, ...]) -> F
 def _explained(one: MissingTorque, effect: type[Push], when: tuple[float, ...]) -> float:
     """Sum of squares of the torque that a push explains."""
     return float(_shown(one, effect, when) @ one.torque) ** 2
-
-
-def _stands_out(one: MissingTorque, effect: type[Push], blow: Blow, pushed: float) -> bool:
-    """Whether a blow rings and explains more than a push, a wave, and noise of the colour of what it leaves."""
-    if blow.when[1] * blow.when[2] < SWINGS:
-        return False
-    angle = 2 * np.pi * blow.when[1] * one.time
-    wave = orthonormal(one.seen(np.column_stack([np.sin(angle), np.cos(angle)])))
-    if blow.explained <= max(pushed, float(np.sum((wave.T @ one.torque) ** 2))):
-        return False
-    shown = _shown(one, effect, blow.when)
-    rest = one.torque - shown * (shown @ one.torque)
-    noise = max(1.4826 * float(np.median(np.abs(rest - np.median(rest)))), one.noise)
-    lasts = LASTS * blow.when[2] / one.period
-    return blow.explained >= CLEAR * noise**2 * max(min(signal_features.memory(rest), lasts), 1.0)

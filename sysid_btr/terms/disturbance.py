@@ -169,12 +169,13 @@ class ExternalDisturbance(Push):
 
 
 @dataclass(frozen=True)
-class ExternalDisturbanceTrain(Push):
+class ExternalDisturbanceTrain(ExternalDisturbance):
     """The same push again and again."""
 
     variant: ClassVar[str] = "train"
     title: ClassVar[str] = "push from outside that comes again and again"
     held: ClassVar[tuple[str, ...]] = (*ExternalDisturbance.held, "period")
+    transient: ClassVar[bool] = False
     kinds: ClassVar[tuple[Kind, ...]] = (*ExternalDisturbance.kinds, Kind("period", "s", 1.0, 0.01, 1e4, 0.01))
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("command_delay", "a motion that does not repeat with the pushes"),
@@ -184,10 +185,6 @@ class ExternalDisturbanceTrain(Push):
     def reaches(cls, *when: float) -> tuple[float, ...]:
         _, duration, period = when
         return *ExternalDisturbance.reaches(*when[:2]), min(0.02 * period, 0.25 * duration)
-
-    @classmethod
-    def lasts(cls, *when: float) -> float:
-        return when[1]
 
     @classmethod
     def impulse(cls, time: FloatArray, *when: FloatArray) -> FloatArray:

@@ -284,7 +284,7 @@ class LoadFrictionPower(LoadFriction):
     Law: torque |T|^exponent, with T the servo's torque in Nm at the middle of each step.
     """
 
-    title: ClassVar[str] = "friction at a load of 1 Nm that grows with a power of it"
+    title: ClassVar[str] = "friction at unit load that grows with a power of it"
     variant: ClassVar[str] = "power"
     label: ClassVar[str] = "load_friction.power"
     kinds: ClassVar[tuple[Kind, ...]] = (
