@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import toys
@@ -41,6 +42,7 @@ from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FreeTorquePeriodic, FreeTorquePosition
 from sysid_btr.terms.friction import (
     CoulombFriction,
+    LoadFrictionPower,
     PreslidingFriction,
     QuadraticDamping,
     StribeckFriction,
@@ -391,6 +393,31 @@ def test_the_toy_leg_without_a_planted_effect_misses_nothing() -> None:
     found = diagnose(None)
     assert found.verdict == "nothing_missing", found.message
     assert found.effects == ()
+
+
+@pytest.mark.parametrize(("size", "exponent"), [(0.05, 0.5), (20.0, 1.5)])
+def test_friction_by_a_power_of_the_load_is_told_of_robots_of_any_size(size: float, exponent: float) -> None:
+    """Masses and gains by a factor change every torque by it, and no position."""
+
+    def resized(spec: mujoco.MjSpec) -> None:
+        for body in spec.bodies:
+            for geom in body.geoms:
+                geom.mass, geom.density = size * geom.mass, size * geom.density
+        for joint in spec.joints:
+            joint.armature, joint.damping = size * joint.armature, size * np.array(joint.damping)
+        for actuator in spec.actuators:
+            actuator.gainprm, actuator.biasprm = size * np.array(actuator.gainprm), size * np.array(actuator.biasprm)
+
+    robot = toys.with_spec(toys.leg(), resized)
+    usual = make_study(robot, [motion()], numerics=toys.FINE).scales["knee"].torque_rms
+    plant = Plant(LoadFrictionPower(KNEE, ranges=((0.0, usual),)), (0.2, exponent))
+    sought = ("coulomb_friction", "viscous_damping", "load_friction", "stribeck_friction", "command_delay")
+    log = seen_by_encoders(plant, motion(), OTHERWISE, robot=robot)
+    found = close(make_study(robot, [log]), TOY_FIT, effects=sought)
+    effect = only_effect(found)
+    assert (effect.effect, effect.variant, effect.where) == ("load_friction", "power", KNEE), found.message
+    assert amount_is(effect, 0, 0.2), effect
+    assert amount_is(effect, 1, exponent), effect
 
 
 def test_a_wave_that_no_law_has_is_learnt_as_one() -> None:

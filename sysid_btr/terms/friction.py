@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import LINK_SUFFIX, Kind
 from sysid_btr.terms.effect import DofEffect, Effect, Probe
 from sysid_btr.terms.law import Step, drive
-from sysid_btr.terms.scales import JointScale
+from sysid_btr.terms.scales import JointScale, Scales, scale_at
 
 if TYPE_CHECKING:
     import mujoco
@@ -279,35 +279,35 @@ class LoadFrictionPower(LoadFriction):
     """Friction that grows with a power of the load, as at contacts that flatten under it.
 
     Two thirds for a sphere on a plane (Bowden and Tabor 1950, "The Friction and Lubrication of Solids"); two where a
-    gear is less efficient, the harder it is driven.
+    gear is less efficient, the harder it is driven. Its ratio is that at the joint's usual load, where the motion tells
+    it apart from the exponent.
 
-    Law: torque |T|^exponent, with T the servo's torque in Nm at the middle of each step.
+    Law: ratio L (|T| / L)^exponent, with T the servo's torque at the middle of each step and L its rms over the log.
     """
 
-    title: ClassVar[str] = "friction at unit load that grows with a power of it"
+    title: ClassVar[str] = "friction per unit of load, at the usual load, that grows with a power of it"
     variant: ClassVar[str] = "power"
     label: ClassVar[str] = "load_friction.power"
-    kinds: ClassVar[tuple[Kind, ...]] = (
-        Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.1),
-        Kind("exponent", "1", 1.0, 0.2, 3.0, 0.1),
-    )
+    kinds: ClassVar[tuple[Kind, ...]] = (*LoadFriction.kinds, Kind("exponent", "1", 1.0, 0.2, 3.0, 0.1))
     held: ClassVar[tuple[str, ...]] = ("exponent",)
     includes: ClassVar[tuple[str, ...]] = ("load_friction",)
 
     @classmethod
-    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
-        exponent = cls.kinds[1]
-        most = scale.counter_peak * max(1.0, scale.torque_rms**-exponent.upper)
-        return (Kind("torque", "Nm", 0.0, 0.0, most, 0.08 * scale.torque_rms), exponent)
-
-    @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
-        return tuple(((0.16 * scale.torque_rms ** (1 - exponent), exponent),) for exponent in (0.5, 2.0))
+        return ((0.16, 0.5),), ((0.16, 2.0),)
+
+    def over(self, scales: Scales) -> Self:
+        return replace(self, ranges=tuple((0.0, scale_at(scales, place).torque_rms) for place in self.places))
+
+    def law_numbers(self, values: FloatArray) -> FloatArray:
+        usual = np.array(self.ranges or [(0.0, 1.0)] * len(self.places))[:, 1]
+        return np.concatenate([values, np.broadcast_to(usual[:, None], (*values.shape[:2], 1))], axis=2)
 
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
         for p, j in enumerate(places):
-            step.friction[j] += numbers[p, 0] * abs(drive(step, j)) ** numbers[p, 1]
+            usual = numbers[p, 2]
+            step.friction[j] += numbers[p, 0] * usual * (abs(drive(step, j)) / usual) ** numbers[p, 1]
 
 
 @dataclass(frozen=True)
