@@ -409,14 +409,16 @@ def test_friction_by_a_power_of_the_load_is_told_of_robots_of_any_size(size: flo
             actuator.gainprm, actuator.biasprm = size * np.array(actuator.gainprm), size * np.array(actuator.biasprm)
 
     robot = toys.with_spec(toys.leg(), resized)
-    usual = make_study(robot, [motion()], numerics=toys.FINE).scales["knee"].torque_rms
-    plant = Plant(LoadFrictionPower(KNEE, ranges=((0.0, usual),)), (0.2, exponent))
+    law = LoadFrictionPower.at(KNEE, make_study(robot, [motion()], numerics=toys.FINE).scales)
+    torque = 0.2 * law.ranges[0][1]
+    plant = Plant(law, (torque, exponent))
     sought = ("coulomb_friction", "viscous_damping", "load_friction", "stribeck_friction", "command_delay")
     log = seen_by_encoders(plant, motion(), OTHERWISE, robot=robot)
     found = close(make_study(robot, [log]), TOY_FIT, effects=sought)
     effect = only_effect(found)
     assert (effect.effect, effect.variant, effect.where) == ("load_friction", "power", KNEE), found.message
-    assert amount_is(effect, 0, 0.2), effect
+    assert f"friction at a load of {law.ranges[0][1]:.3g} Nm" in found.message
+    assert amount_is(effect, 0, torque), effect
     assert amount_is(effect, 1, exponent), effect
 
 

@@ -458,13 +458,13 @@ def test_friction_of_the_larger_load_holds_more_where_the_weight_is_the_larger()
 def test_friction_by_a_power_of_the_load_holds_that_much(exponent: float) -> None:
     q = rest(LoadFrictionPower, [0.2, exponent])
     servo, usual = abs(KP * (COMMAND - q)), SCALES["arm"].torque_rms
-    assert 0.02 < abs(servo - abs(gravity(q))) <= 0.2 * usual * (servo / usual) ** exponent * 1.001
+    assert 0.02 < abs(servo - abs(gravity(q))) <= 0.2 * (servo / usual) ** exponent * 1.001
 
 
 def test_friction_by_the_first_power_of_the_load_is_that_per_unit_of_load() -> None:
     log = swing()
     ratio = position(pendulum(), log, [at_arm(LoadFriction)], [0.2])
-    power = position(pendulum(), log, [at_arm(LoadFrictionPower)], [0.2, 1.0])
+    power = position(pendulum(), log, [at_arm(LoadFrictionPower)], [0.2 * SCALES["arm"].torque_rms, 1.0])
     np.testing.assert_allclose(power, ratio, atol=1e-9)
 
 

@@ -12,7 +12,7 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.terms.base import LINK_SUFFIX, Kind
 from sysid_btr.terms.effect import DofEffect, Effect, Probe
 from sysid_btr.terms.law import Step, drive
-from sysid_btr.terms.scales import JointScale, Scales, scale_at
+from sysid_btr.terms.scales import JointScale, Scales, middle_scale
 
 if TYPE_CHECKING:
     import mujoco
@@ -279,25 +279,41 @@ class LoadFrictionPower(LoadFriction):
     """Friction that grows with a power of the load, as at contacts that flatten under it.
 
     Two thirds for a sphere on a plane (Bowden and Tabor 1950, "The Friction and Lubrication of Solids"); two where a
-    gear is less efficient, the harder it is driven. Its ratio is that at the joint's usual load, where the motion tells
-    it apart from the exponent.
+    gear is less efficient, the harder it is driven. Its torque is that at a load which is usual for the robot, where
+    motion tells it apart from the exponent.
 
-    Law: ratio L (|T| / L)^exponent, with T the servo's torque at the middle of each step and L its rms over the log.
+    Law: torque (|T| / L)^exponent, with T the servo's torque at the middle of each step and L the median over joints of
+    its rms.
     """
 
-    title: ClassVar[str] = "friction per unit of load, at the usual load, that grows with a power of it"
+    title: ClassVar[str] = "friction at the robot's usual load that grows with a power of it"
     variant: ClassVar[str] = "power"
     label: ClassVar[str] = "load_friction.power"
-    kinds: ClassVar[tuple[Kind, ...]] = (*LoadFriction.kinds, Kind("exponent", "1", 1.0, 0.2, 3.0, 0.1))
+    kinds: ClassVar[tuple[Kind, ...]] = (
+        Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.1),
+        Kind("exponent", "1", 1.0, 0.2, 3.0, 0.1),
+    )
     held: ClassVar[tuple[str, ...]] = ("exponent",)
     includes: ClassVar[tuple[str, ...]] = ("load_friction",)
 
     @classmethod
+    def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
+        return (Kind("torque", "Nm", 0.0, 0.0, scale.counter_peak, 0.08 * scale.torque_rms), cls.kinds[1])
+
+    @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
-        return ((0.16, 0.5),), ((0.16, 2.0),)
+        return tuple(((0.16 * scale.torque_rms, exponent),) for exponent in (0.5, 2.0))
+
+    @property
+    def described(self) -> str:
+        if not self.ranges:
+            return super().described
+        load = f"{self.ranges[0][1]:.3g} {'N' if self.slides else 'Nm'}"
+        return f"friction at a load of {load} that grows with a power of it"
 
     def over(self, scales: Scales) -> Self:
-        return replace(self, ranges=tuple((0.0, scale_at(scales, place).torque_rms) for place in self.places))
+        usual = middle_scale(list(scales.values())).torque_rms
+        return replace(self, ranges=((0.0, usual),) * len(self.places))
 
     def law_numbers(self, values: FloatArray) -> FloatArray:
         usual = np.array(self.ranges or [(0.0, 1.0)] * len(self.places))[:, 1]
@@ -306,8 +322,7 @@ class LoadFrictionPower(LoadFriction):
     @staticmethod
     def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
         for p, j in enumerate(places):
-            usual = numbers[p, 2]
-            step.friction[j] += numbers[p, 0] * usual * (abs(drive(step, j)) / usual) ** numbers[p, 1]
+            step.friction[j] += numbers[p, 0] * (abs(drive(step, j)) / numbers[p, 2]) ** numbers[p, 1]
 
 
 @dataclass(frozen=True)
