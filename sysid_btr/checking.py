@@ -246,7 +246,7 @@ def check(
         As `make_study` does.
     """
     from sysid_btr.diagnosis.close import usable_effects
-    from sysid_btr.estimators.lsq import linearise
+    from sysid_btr.estimators.linearisation import linearise
     from sysid_btr.terms.library import select_effects
 
     if not odds > 1:

@@ -188,7 +188,8 @@ def test_least_squares_journal_is_small_and_never_holds_residuals(tmp_path: Path
 
 
 def test_least_squares_resumes_from_every_record(tmp_path: Path) -> None:
-    """Killed between any two batches, it repeats none and ends with the same bits, Jacobian included."""
+    """Killed between any two batches, it skips none, simulates what the journal cannot hold at most once more, and ends
+    with the same bits, Jacobian included."""
     problem = exponential_decay(np.random.default_rng(0), noise=0.01)
     estimator = get_estimator("lsq", n_starts=2)
     reference = Witness(problem)
@@ -201,7 +202,7 @@ def test_least_squares_resumes_from_every_record(tmp_path: Path) -> None:
             run(estimator, witness, journal=Journal(path))
         again = Witness(problem)
         resumed = run(estimator, again, journal=Journal(path))
-        assert witness.asked() + again.asked() == reference.asked()
+        assert again.goes_on(witness, reference, again=1)
         assert resumed.jacobian is not None
         assert resumed.jacobian.tobytes() == whole.jacobian.tobytes()
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.intervals import Estimate, estimates

@@ -19,7 +19,8 @@ from sysid_btr.display.text import exactness
 from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, Derived, silent
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.fixing import fewest_to_fix
 from sysid_btr.identify.intervals import Estimate, estimates

@@ -9,7 +9,7 @@ import pytest
 import toys
 
 from sysid_btr.display.text import exactness
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.prior import MapProblem, Stated
 from sysid_btr.identify.study import Study, make_study

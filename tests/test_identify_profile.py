@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.profile import chosen_names, profile, profile_curve

@@ -14,7 +14,8 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.errors import NotConvergedError, UsageError
 from sysid_btr.estimators import Budget, Journal, silent
 from sysid_btr.estimators.ensemble import autocorrelation_time, bounded, folded, log_jacobian, unbounded
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.posterior import sampling
 from sysid_btr.posterior.likelihood import Likelihood, make_likelihood, settle
 from sysid_btr.posterior.priors import LogNormal, Normal, Prior, Uniform

@@ -14,7 +14,8 @@ from walks import Scale, Truth, heavier, plain_walk, record_walk
 
 from sysid_btr.errors import LogError
 from sysid_btr.estimators import Budget, Journal, silent
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.floating_base import segments as segments_module
 from sysid_btr.floating_base.contact_free import without_ground
 from sysid_btr.floating_base.episode import FloatingEpisode, reconstruct

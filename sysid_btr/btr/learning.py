@@ -18,7 +18,8 @@ from sysid_btr.btr.robot import Trial
 from sysid_btr.errors import LogError, ModelError, UsageError
 from sysid_btr.estimators.base import Budget, Estimator, Progress, Termination
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.prior import MapProblem
 from sysid_btr.identify.refit import Fitted, inflate, judge

@@ -17,7 +17,7 @@ from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, pertur
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.journal import Record
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.missing_torque import missing_torques
 from sysid_btr.identify.projection import explained_by
 from sysid_btr.identify.refit import inflate, judge, shorten

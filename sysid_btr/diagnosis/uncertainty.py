@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.deferred import cheaper
 from sysid_btr.identify.discrepancy import widened
 from sysid_btr.identify.ends import followed

@@ -27,7 +27,8 @@ from sysid_btr.estimators.ensemble import Ensemble
 from sysid_btr.estimators.evaluator import Evaluator, Outcome, Reduced, Stop, drive
 from sysid_btr.estimators.ga import GeneticAlgorithm
 from sysid_btr.estimators.journal import Journal, Record
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.estimators.registry import available, get_estimator
 
 __all__ = [

@@ -162,6 +162,13 @@ class Evaluator:
         self._account(asked, record.arrays["loss"], note)
         return Reduced(record.arrays["loss"], record.arrays, lambda: self._journal.attachment(number))
 
+    def again(self, function: Callable[[FloatArray], FloatArray], candidates: FloatArray) -> FloatArray:
+        """What a function gives for candidates that were accounted for before; not journalled.
+
+        For arrays that a journal does not hold.
+        """
+        return self._simulate(function, self._admit(candidates))
+
     def _admit(self, candidates: FloatArray) -> FloatArray:
         asked = np.ascontiguousarray(candidates, dtype=np.float64)
         if asked.ndim != 2 or asked.shape[1] != len(self.start) or not np.all(np.isfinite(asked)):

@@ -23,7 +23,7 @@ from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Budget, Estimator, FitResult, Progress
 from sysid_btr.estimators.cma_es import CmaEs
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.estimators.registry import get_estimator
 from sysid_btr.excite.motion import Clock, Family, as_log, find_motors
 from sysid_btr.excite.settings import MotionSettings

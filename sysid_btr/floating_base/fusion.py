@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.floating_base.contact_free import without_ground
 from sysid_btr.floating_base.segments import FloatingReplay
 from sysid_btr.floating_base.strides import GROUND, GROUND_MASS, of_legs, repeated_error, walked_residuals

@@ -9,7 +9,8 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, Progress, silent
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.refit import Fitted, judge
 from sysid_btr.identify.step_check import Optimum
 from sysid_btr.identify.study import Study

@@ -15,7 +15,7 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.estimators.base import Budget, Derived, FitResult, Progress, ResidualEstimator, Termination
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.prior import MapProblem
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.numerics import Numerics

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.numerics import largest_step
 from sysid_btr.identify.segmented import SegmentedEpisode, follow
 from sysid_btr.io.log import Log

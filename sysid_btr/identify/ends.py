@@ -16,7 +16,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.estimators.base import ResidualProblem
-from sysid_btr.estimators.lsq import Pattern
+from sysid_btr.estimators.linearisation import Pattern
 from sysid_btr.identify.intervals import NORMAL, Estimate, responses
 from sysid_btr.terms.base import Parameter
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.objectives.problem import Conditional
 from sysid_btr.terms.grammar import check_expression, parse_parameters
 from sysid_btr.terms.model import Model, Terms

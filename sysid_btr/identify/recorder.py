@@ -13,7 +13,7 @@ from math import log
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.projection import explained_by
 from sysid_btr.identify.refit import nearby, shorten
 from sysid_btr.identify.study import Study

@@ -21,6 +21,9 @@ from sysid_btr.terms.model import Model, Terms
 
 CORRELATED = 1.5
 """Chi2 of a column beyond which its residual is an error of the model rather than noise."""
+TOLERANCE = 1e-3
+"""Decrease, a fraction of the loss, for which a hypothesis is not simulated again: all of it in one of 22 columns is a
+third of what hypotheses may differ by and count as equal (`Selection.simpler`)."""
 NOTICEABLE = 0.99
 """Fraction of a loss that another start must reach."""
 RELIEVED = 0.5
@@ -142,7 +145,7 @@ def _minimised(
     estimator = LeastSquares(
         confirm=polish,
         max_iterations=30 if polish else iterations,
-        tolerance=1e-6 if polish else 2e-4,
+        tolerance=1e-6 if polish else TOLERANCE,
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
     structural, step = model.terms.structural, study.stencil(model.terms)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.estimators.lsq import linearise
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.objectives.problem import Comparison, Conditional, ReplayProblem
 from sysid_btr.objectives.targets import Target
 from sysid_btr.simulation.start import Start, start_error

@@ -10,7 +10,8 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators.base import Budget, FitResult, Progress
 from sysid_btr.estimators.journal import Journal
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import newton

@@ -22,7 +22,8 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.estimators.base import Problem, UnitBox
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.objectives.covariance import scatter
 
 RANK = 1e-9
