@@ -33,7 +33,7 @@ NOT_RIGID = ("dof_frictionloss", "tendon_frictionloss", *(f"actuator_{n}" for n 
 BETWEEN = ("dof_", "jnt_stiffness", "qpos_spring", "tendon_")
 """Beginnings of fields that it depends on, and that part of it which masses make does not."""
 ROUNDS = 8
-"""In which friction that follows the servo's torque is found: a ratio of 0.5 is within 0.4 % then."""
+"""In which friction that follows the servo's torque is found, at most: one that goes with it takes three."""
 
 
 class Rigid(NamedTuple):
@@ -184,16 +184,24 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[
     if not laws:
         return [None] * candidates
     # imports what compiles laws, which takes a second
-    from sysid_btr.simulation.laws import table_of
+    from sysid_btr.simulation.laws import side_by_side, table_of
     from sysid_btr.simulation.stepping import Samples, on_samples
 
     table, numbers, awake = table_of(laws, candidates)
-    position, velocity = (np.ascontiguousarray(x) for x in (motion.position, motion.velocity))
+    n, joints = motion.position.shape
+    # laws of a place each take all samples at once; others, which may join places, sample by sample
+    together = n if all(table.rows == np.diff(table.place)) else 1
+
+    def wide(values: FloatArray) -> FloatArray:
+        return np.ascontiguousarray(values).reshape(-1, together * joints)
+
+    position, velocity, direction = (wide(x) for x in (motion.position, motion.velocity, motion.direction))
 
     def act(candidate: int, dry: FloatArray, smooth: FloatArray, load: FloatArray, torque: FloatArray) -> None:
         # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
-        samples = Samples(position, velocity, motion.direction, smooth, load)
-        on_samples(table, numbers[candidate], awake[candidate], motion.period, ROUNDS, samples, dry, torque)
+        samples = Samples(position, velocity, direction, wide(smooth), wide(load))
+        many, own = side_by_side(table, numbers[candidate], joints, together)
+        on_samples(many, own, awake[candidate], motion.period, ROUNDS, samples, np.tile(dry, together), wide(torque))
 
     return [partial(act, i) if awake[i].any() else None for i in range(candidates)]
 

@@ -71,6 +71,28 @@ def table_of(laws: Sequence[Law], candidates: int) -> tuple[Laws, FloatArray, Bo
     return table, flat, awake
 
 
+def side_by_side(laws: Laws, numbers: FloatArray, joints: int, count: int) -> tuple[Laws, FloatArray]:
+    """Laws (n,) and one candidate's numbers (k,) for a robot that is there so many times, its joints one after another.
+
+    Of laws that have a row for each place, and so act on each by itself, and no memory.
+    """
+    own = [
+        np.tile(numbers[a:b].reshape(rows, -1), (count, 1)).ravel()
+        for a, b, rows in zip(laws.number[:-1], laws.number[1:], laws.rows, strict=True)
+    ]
+    places = [
+        (laws.places[a:b] + joints * np.arange(count)[:, None]).ravel()
+        for a, b in zip(laws.place[:-1], laws.place[1:], strict=True)
+    ]
+    many = laws._replace(
+        rows=laws.rows * count,
+        number=laws.number * count,
+        place=laws.place * count,
+        places=_whole(np.concatenate([np.zeros(0), *places])),
+    )
+    return many, np.concatenate([np.zeros(0), *own])
+
+
 def _whole(values: Any) -> IntArray:
     return np.asarray(values, dtype=np.int64)
 

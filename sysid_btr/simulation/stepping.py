@@ -205,9 +205,9 @@ def _call_law(typing: Any, address: Any, step: Any, numbers: Any, memory: Any, p
 call_law = intrinsic(_call_law)
 
 
-def _apply(laws: Laws, numbers: Any, awake: Any, memory: Any, time: float, timestep: float, rows: Any) -> None:
-    """Let laws act on the arrays (ROWS, j) of a step of one candidate, whose numbers and memory they are."""
-    step = Step(
+def _step(time: float, timestep: float, rows: Any) -> Step:
+    """A step whose arrays are rows (ROWS, j)."""
+    return Step(
         time,
         timestep,
         rows[COMMAND],
@@ -225,6 +225,13 @@ def _apply(laws: Laws, numbers: Any, awake: Any, memory: Any, time: float, times
         rows[LOW],
         rows[HIGH],
     )
+
+
+step_of = compiled(_step)
+
+
+def _apply(laws: Laws, numbers: Any, awake: Any, memory: Any, step: Step) -> None:
+    """Let laws act on a step of one candidate, whose numbers and memory they are."""
     for n in range(len(laws.address)):
         if not awake[n]:
             continue
@@ -322,7 +329,8 @@ def _act(k: int, i: int, plan: Plan, own: Candidates, engine: Engine, memory: Me
         torque_of(i, plan, own, step[COMMAND], step[QPOS], step[QVEL], step[TORQUE])
         step[TORQUE] = np.minimum(np.maximum(step[TORQUE], step[LOW]), step[HIGH])
         write_proportional(i, plan, own, step)
-        apply_laws(plan.laws, own.numbers[i], own.awake[i], memory.laws, own.began[i] + (k * h + 0.5 * h), h, step)
+        now = step_of(own.began[i] + (k * h + 0.5 * h), h, step)
+        apply_laws(plan.laws, own.numbers[i], own.awake[i], memory.laws, now)
         if plan.friction:
             for j in range(len(q)):
                 engine.dof_frictionloss[plan.dof[j]] = max(own.own_friction[i, j] + step[FRICTION, j], 0.0)
@@ -453,6 +461,13 @@ def _roll(first: int, last: int, plan: Plan, own: Candidates, thread: Thread, ke
 roll = compiled(_roll)
 
 
+SETTLED = 1e-7
+"""Relative change of a torque under laws that follow it, from which it has settled; the last step leaves less."""
+STEEPEST = -0.1
+"""Slope of what laws make of a torque less that torque itself, up to which a secant is followed: where laws add as much
+as they are given, it is 0 and there is no one solution."""
+
+
 class Samples(NamedTuple):
     """Samples (n, j) of a motion, and what it takes.
 
@@ -481,23 +496,31 @@ def _on_samples(
 ) -> None:
     """Find the torques (n, j) of drives under laws without memory, which may follow them, from those that are there.
 
-    `dry` is the friction (j,) that there is without laws.
+    `rounds` is how often laws are asked at most; `dry` is the friction (j,) that there is without laws.
     """
     rows, memory = np.zeros((ROWS, len(dry))), np.zeros(0)
     rows[VOLTAGE], rows[ENABLED] = np.nan, 1.0
+    step, before, excess = step_of(0.0, period, rows), np.zeros(len(dry)), np.zeros(len(dry))
     for i in range(len(torque)):
-        rows[COMMAND], rows[QPOS], rows[QVEL] = samples.position[i], samples.position[i], samples.velocity[i]
-        rows[LOAD] = samples.load[i]
-        for _ in range(rounds):
-            rows[TORQUE], rows[GAIN], rows[LOW], rows[HIGH] = torque[i], 1.0, -np.inf, np.inf
-            rows[MOTOR], rows[JOINT], rows[FRICTION] = 0.0, 0.0, 0.0
-            apply_laws(laws, numbers, awake, memory, 0.0, period, rows)
+        # number by number: numba takes longer over a short row as a whole
+        for j in range(len(dry)):
+            rows[COMMAND, j] = rows[QPOS, j] = samples.position[i, j]
+            rows[QVEL, j], rows[LOAD, j] = samples.velocity[i, j], samples.load[i, j]
+        for k in range(rounds):
+            for j in range(len(dry)):
+                rows[TORQUE, j], rows[GAIN, j], rows[LOW, j], rows[HIGH, j] = torque[i, j], 1.0, -np.inf, np.inf
+                rows[MOTOR, j] = rows[JOINT, j] = rows[FRICTION, j] = 0.0
+            apply_laws(laws, numbers, awake, memory, step)
             settled = True
             for j in range(len(dry)):
                 rubbed = max(dry[j] + rows[FRICTION, j], 0.0) * samples.direction[i, j]
-                found = samples.smooth[i, j] + rubbed - rows[JOINT, j]
-                settled = settled and found == torque[i, j]
-                torque[i, j] = found
+                now, own = torque[i, j], samples.smooth[i, j] + rubbed - rows[JOINT, j]
+                beyond = own - now
+                settled = settled and abs(beyond) <= SETTLED * abs(own)
+                # the secant through the last two, joint by joint; the first step goes to what the laws give
+                slope = (beyond - excess[j]) / (now - before[j]) if k > 0 and now != before[j] else -1.0
+                before[j], excess[j] = now, beyond
+                torque[i, j] = now - beyond / slope if slope < STEEPEST else own
             if settled:
                 break
 
