@@ -138,14 +138,25 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
     def order(trial: Trial) -> tuple[int, float]:
         return trial.hypothesis.complexity, trial.fitted.misfit
 
-    best = min(t.fitted.misfit for t in trials)
-    near = [t for t in trials if t.fitted.misfit <= best + rules.simpler]
+    best = min(trials, key=lambda t: t.fitted.misfit)
+    near = [t for t in trials if t.fitted.misfit <= best.fitted.misfit + rules.simpler or is_refined(rules, t, best)]
     named = {t.hypothesis.effect.name for t in near}
     near = [t for t in near if not named & set(t.hypothesis.effect.yields_to)]
     simplest = min(near, key=order)
     others = [t for t in near if _is_another(t.hypothesis, simplest.hypothesis)]
     better = [t for t in others if t.fitted.misfit < simplest.fitted.misfit]
     return min([t for t in better if paired_t(t.fitted, simplest.fitted) > rules.t] or [simplest], key=order)
+
+
+def is_refined(rules: Selection, simple: Trial, best: Trial) -> bool:
+    """Whether the best form of a family has more numbers than another at the same locations, which it beats by chance."""
+    ours, theirs = simple.hypothesis, best.hypothesis
+    return (
+        family_of(ours.effect) == family_of(theirs.effect)
+        and set(ours.places) == set(theirs.places)
+        and ours.complexity < theirs.complexity
+        and paired_t(best.fitted, simple.fitted) < rules.t
+    )
 
 
 def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner: Trial) -> Trial:
