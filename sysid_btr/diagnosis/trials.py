@@ -149,7 +149,7 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
 
 
 def is_refined(rules: Selection, simple: Trial, best: Trial) -> bool:
-    """Whether the best form of a family has more numbers than another at the same locations, which it beats by chance."""
+    """Whether the best form of a family has more numbers than another at its locations, and beats it as chance may."""
     ours, theirs = simple.hypothesis, best.hypothesis
     return (
         family_of(ours.effect) == family_of(theirs.effect)
