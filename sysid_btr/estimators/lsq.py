@@ -13,7 +13,7 @@ parameters that are confounded stay where they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -34,6 +34,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.linearisation import (
     CENTRAL_STEP,
     WIDEST_STEP,
+    Known,
     LinearModel,
     Neighbour,
     Scheme,
@@ -114,6 +115,8 @@ class LeastSquares:
     least_gain
         Decrease of the loss, in mean squared residuals, that is worth a step: 0.01 is a tenth of a standard
         deviation. More where the objective is rough.
+    known
+        Derivatives that need no simulation to begin with.
 
     Notes
     -----
@@ -134,6 +137,7 @@ class LeastSquares:
     prescreen: int = 8
     confirm: bool = True
     least_gain: float = _STD_FRACTION
+    known: Known | None = field(default=None, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or self.n_starts < 1 or self.prescreen < 1:
@@ -244,7 +248,8 @@ class LeastSquares:
                 if measured == self.max_iterations:
                     break
                 measured += 1
-                model, steps = linear_model(problem, evaluator, u, steps, scheme, note)
+                known = self.known if measured == 1 and not scheme.central else None
+                model, steps = linear_model(problem, evaluator, u, steps, scheme, note, known)
                 _require_consistent(loss, model.loss)
                 moved = 0.0
             full = model.step(0.0, -u, 1.0 - u, scheme.rank_tolerance)
