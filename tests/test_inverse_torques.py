@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -12,12 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.models.actuation import with_motors
 from sysid_btr.models.robot import robot_from_file
 from sysid_btr.simulation.inverse import InverseReplay
 from sysid_btr.simulation.kinematics import Kinematics
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.setup import Values
 from sysid_btr.terms.base import BatchModel, Fields
+from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.model import Terms
 
 SAMPLES = 24
 LINE = """<mujoco><compiler angle="radian"/><option timestep="0.001"{option}/><worldbody>
@@ -185,3 +189,38 @@ def test_what_a_model_turns_off_takes_nothing(replay_of: Callable[[str], Changed
     replay = replay_of(PLAIN.replace('timestep="0.001"/>', f'timestep="0.001"><flag {word}="disable"/></option>'))
     assert replay.model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, bit))
     assert_alike(replay, changed(replay, np.random.default_rng(4), (*SPRINGS, *TENDONS)))
+
+
+@pytest.mark.parametrize("expression", ["load_friction", "load_friction.larger", "load_friction.power"])
+def test_friction_that_follows_a_torque_is_that_of_the_torque_which_it_makes(tmp_path: Path, expression: str) -> None:
+    """Found for all samples at once; beside a law that joins drives, sample by sample."""
+    (tmp_path / "robot.xml").write_text(LEG.split("<tendon>")[0] + "</mujoco>")
+    robot = with_motors(robot_from_file(tmp_path / "robot.xml"))
+    joints = ("hip", "turn", "knee")
+    motion = noise(3)
+    channels = {f"position.{j}": motion.position[:, k] for k, j in enumerate(joints)}
+    log = Log(motion.time, channels, LogMeta(sample_period=0.01), np.zeros(SAMPLES, dtype=np.int64))
+
+    def torque(*expressions: str, values: list[float]) -> np.ndarray:
+        terms = Terms(parse_parameters(list(expressions), robot))
+        numerics = Numerics("implicitfast", 0.001)
+        replay = InverseReplay(robot, log, tuple(terms), numerics, effort=True, threads=1, kinematics=motion)
+        found = replay.predict(np.array([values])).effort
+        assert found is not None
+        return found[0]
+
+    smooth = torque("damping:*=shared", values=[0.0])
+    power = expression.endswith("power")
+    amounts = [0.4, 0.6] if power else [0.3]
+    found = torque(f"{expression}:*=shared", values=amounts)
+    load = np.abs(found) ** amounts[-1] if power else np.abs(found)
+    if expression.endswith("larger"):
+        load = np.maximum(load, np.abs(smooth))
+    made = smooth + amounts[0] * load * motion.direction
+    # where friction turns a torque round, several torques are right, and none may be found
+    clear = np.abs(smooth) > 1.0
+    assert clear.mean() > 0.5
+    np.testing.assert_allclose(found[clear], made[clear], rtol=1e-5)
+    assert np.abs(found - smooth).max() > 0.1
+    beside = torque(f"{expression}:*=shared", "voltage_sag.time:robot", values=[*amounts, 0.0])
+    np.testing.assert_allclose(beside[clear], found[clear], rtol=1e-6)
