@@ -166,14 +166,14 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
 def is_refined(rules: Selection, simple: Trial, best: Trial) -> bool:
     """Whether the best form of a family has more numbers than another at its locations, and beats it as chance may.
 
-    Not by chance where it removes much of what the other leaves.
+    Curves have a rule of their own, see `has_law`.
     """
     ours, theirs = simple.hypothesis, best.hypothesis
     return (
-        family_of(ours.effect) == family_of(theirs.effect)
+        theirs.effect not in FREE_FORMS
+        and family_of(ours.effect) == family_of(theirs.effect)
         and set(ours.places) == set(theirs.places)
         and ours.complexity < theirs.complexity
-        and best.fitted.holdout > (1 - rules.certain) * simple.fitted.holdout
         and paired_t(best.fitted, simple.fitted) < rules.t
     )
 
