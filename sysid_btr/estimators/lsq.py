@@ -1,14 +1,15 @@
 """Batched Gauss-Newton / Levenberg-Marquardt least squares in a box.
 
-One iteration is two batches: the finite-difference stencil of all parameters, and the undamped step with a
-damped one; where that keeps little of what it promised a third, the rest of a ladder of damping factors, of
-which the best is taken. All are what a parallel simulator does well. Steps are solutions of the damped
+A stencil of all parameters begins, and from there each step is one batch of two: the undamped step with a damped one;
+where that keeps little of what it promised a third, the rest of a ladder of damping factors, of which the best is
+taken. What the residuals did on the way says how the derivatives changed (Broyden 1965), and the next stencil is
+simulated where a step keeps too little. All are what a parallel simulator does well. Steps are solutions of the damped
 linear problem *with* the bounds, so an active bound never spoils a step.
 
-Residuals are long and parameters few: an iteration keeps only the normal matrix ``J^T J`` and ``J^T r``, and
-the journal records those. Steps are taken in the unit cube of the bounds, with columns scaled to unit length
-(Marquardt 1963, doi:10.1137/0111030); directions the residuals do not see are cut from the spectrum, so
-parameters that are confounded stay where they are.
+Residuals are long and parameters few: the journal records only the normal matrix ``J^T J`` and ``J^T r``; ``J`` is in
+memory, and simulated once more where a fit is resumed. Steps are taken in the unit cube of the bounds, with columns
+scaled to unit length (Marquardt 1963, doi:10.1137/0111030); directions the residuals do not see are cut from the
+spectrum, so parameters that are confounded stay where they are.
 """
 
 from __future__ import annotations
@@ -79,8 +80,8 @@ class _Point:
 class LeastSquares:
     """Levenberg-Marquardt on batched finite differences, within bounds.
 
-    Forward differences lead to the minimum (``p + 1`` candidates and the ladder an iteration); central ones
-    (``2 p + 1``) confirm it, and give the Jacobian of the result.
+    Forward differences (``p + 1`` candidates) and what steps show of the derivatives lead to the minimum; central ones
+    (``2 p + 1``), at every step, confirm it, and give the Jacobian of the result.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ class LeastSquares:
         Directions whose singular value, columns at unit length, is below this fraction of the largest are not
         moved. The error of the differences hides what lies below.
     max_iterations
-        Iterations with forward differences from each start, and again with central ones.
+        Forward differences from each start at most, and central ones; up to four steps follow from each.
     n_starts
         Points to descend from: the problem's start, then `starts`, then random ones.
     starts
@@ -120,7 +121,8 @@ class LeastSquares:
 
     Notes
     -----
-    Method: Nocedal and Wright, Numerical Optimization (2006), ch. 10, doi:10.1007/978-0-387-40065-5.
+    Method: Nocedal and Wright, Numerical Optimization (2006), ch. 10, doi:10.1007/978-0-387-40065-5; Madsen, Nielsen,
+    Tingleff, Methods for Non-Linear Least Squares Problems (2004), section 3.5.
     """
 
     tolerance: float = 1e-6
@@ -241,14 +243,14 @@ class LeastSquares:
         scheme: Scheme,
     ) -> _Point:
         ladder, slow, halted = self._ladder(_FIRST_DAMPING, trust=False), 0, Termination.STALLED
-        model, moved, measured = None, 0.0, 0
+        model, moved, stencils = None, 0.0, 0
         for iteration in range(1, _STEPS * self.max_iterations + 1):
             note = f"iteration {iteration}"
             if model is None:
-                if measured == self.max_iterations:
+                if stencils == self.max_iterations:
                     break
-                measured += 1
-                known = self.known if measured == 1 and not scheme.central else None
+                stencils += 1
+                known = self.known if stencils == 1 and not scheme.central else None
                 model, steps = linear_model(problem, evaluator, u, steps, scheme, note, known)
                 _require_consistent(loss, model.loss)
                 moved = 0.0
@@ -286,8 +288,8 @@ class LeastSquares:
             if slow == 2 and gained < tolerance * loss:
                 # Two steps without a gain worth having: stay where the model was made.
                 return _Point(u, loss, steps, halted, model)
-            good = found.neighbour is not None and gained >= _KEEPS * promised
-            model = model.moved(u, found.neighbour) if good and found.neighbour is not None else None
+            told = found.neighbour if gained >= _KEEPS * promised else None
+            model = None if told is None else model.moved(u, told)
             u, loss, moved = found.u, found.loss, moved + gained
             if slow == 2 and not scheme.central:
                 return _Point(u, loss, steps, halted)
