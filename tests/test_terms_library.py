@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from toys import LEG_JOINTS, SCALE, leg, position, swing
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import UsageError
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Kind, Term
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.free_form import FreeTorquePosition
-from sysid_btr.terms.friction import CoulombFriction
+from sysid_btr.terms.friction import CoulombFriction, LoadFriction
 from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.law import Step
 from sysid_btr.terms.library import all_terms, effect_names, select_effects
 from sysid_btr.terms.scales import Scales
 from sysid_btr.terms.transmission import JointCompliance
@@ -110,9 +111,24 @@ class Undescribed(CoulombFriction):
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("torque", "furlong", 0.0, 0.0, 10.0, 0.05),)
 
 
+@dataclass(frozen=True)
+class Joining(LoadFriction):
+    """Friction at each joint that follows the torques of all.
+
+    Law: adds to the friction.
+    """
+
+    @staticmethod
+    def law(step: Step, numbers: FloatArray, memory: FloatArray, places: IntArray) -> None:
+        for p, j in enumerate(places):
+            for k in places:
+                step.friction[j] += numbers[p, 0] * abs(step.torque[k])
+
+
 @pytest.mark.parametrize(
     ("cls", "promise"),
     [
+        (Joining, "what its law does at .* depends on another: give it scope robot"),
         (NotNeutral, "its neutral value changes the plain model"),
         (Idle, "changes nothing"),
         (Neighbourly, "moves otherwise beside another candidate|neutral value changes"),

@@ -56,7 +56,10 @@ ROWS = len(Step._fields) - 2
 """Arrays of a step."""
 
 Law = Callable[[Step, FloatArray, FloatArray, IntArray], None]
-"""Acts on a step by its numbers (rows, n), its memory (rows, kept) and the positions of its places among the joints."""
+"""Acts on a step by its numbers (rows, n), its memory (rows, kept) and the positions of its places among the joints.
+
+With a row for each place it acts on each by what is there alone.
+"""
 
 
 def used_in_laws(function: Function) -> Function:

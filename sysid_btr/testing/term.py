@@ -23,6 +23,7 @@ from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Kind, Parameter, Term
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.grammar import make_term
+from sysid_btr.terms.law import ROWS, Step
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import JointScale, scale_at
 from sysid_btr.testing.require import require
@@ -235,6 +236,26 @@ def check_shared(cls: type[Term], bench: TermBench) -> None:
     require(bool(np.abs(one[0] - each[0]).max() <= EXACT), f"{cls.name}: one amount for all is not that amount at each")
 
 
+def check_alone(cls: type[Term], bench: TermBench) -> None:
+    """What a law with numbers for each place does at one of them depends on what is there alone.
+
+    Inverse dynamics show it all samples at once, as if the robot were there so many times.
+    """
+    places = bench.study.robot.names(cls.scope)
+    if cls.scope == "robot" or not cls.overrides("law") or len(places) < 2:
+        return
+    term = cls.at(places, bench.study.scales)
+    cases = np.array([clear_case(cls, scale_at(bench.study.scales, place)) for place in places])
+    numbers, rng = term.law_numbers(cases[None])[0], np.random.default_rng(0)
+    rows = 1 + 0.1 * rng.normal(size=(ROWS, len(places)))
+    rows[-2] -= 5  # the lower limit
+    others = rows + np.where(np.arange(len(places)) == 0, 0.0, 0.1 * rng.normal(size=rows.shape))
+    for step in (Step(0.1, 0.01, *rows), Step(0.1, 0.01, *others)):
+        cls.law(step, numbers, np.zeros((len(places), cls.law_memory)), np.arange(len(places)))
+    same = np.array_equal(rows[:, 0], others[:, 0])
+    require(same, f"{cls.name}: what its law does at {places[0]} depends on another: give it scope robot")
+
+
 def check_written(cls: type[Term], bench: TermBench) -> None:
     """A written model, read again, moves the same; or the file and the result say what is not in it."""
     for term, case in bench.forms(cls):
@@ -256,6 +277,7 @@ TERM_CHECKS: Sequence[Callable[[type[Term], TermBench], None]] = (
     check_neutral,
     check_neighbours,
     check_shared,
+    check_alone,
     check_written,
 )
 """Each takes the class of a term and a bench."""
