@@ -55,6 +55,7 @@ _SLOW_FRACTION = 0.5  # a step that gains less than this, in the same unit ...
 _MANY = 1000  # residuals, from which on their mean square says what noise is
 _KEPT = 0.1  # ... and less than this share of what it promised tells of a rough objective, not of a way to go
 _KEEPS = 0.25  # of what it promised: a step that gains less is too long (Nocedal and Wright 2006, algorithm 4.1)
+_TELLS = 0.75  # the same of derivatives that are not of this very point: the step is a good one (ibid.)
 _LOSS_MISMATCH = 1e-6
 _STEPS = 4  # at most for each stencil
 _FAR = 0.1  # of the loss: steps that gained more end at differences of their own
@@ -268,10 +269,10 @@ class LeastSquares:
                 return _Point(u, loss, steps, Termination.STALLED if model.failed.any() else there, model)
             found = _climb(evaluator, problem, model, u, loss, scheme, ladder, promised, note)
             gained = 0.0 if found is None else loss - found.loss
-            if not model.measured and gained < _KEEPS * promised:
-                # what steps showed of the derivatives is not enough here
+            if not model.measured and gained < _TELLS * promised:
+                # derivatives that are not these are not enough; what was known beforehand may be of another valley
                 model = None
-                if found is not None:
+                if found is not None and moved > 0.0:
                     u, loss = found.u, found.loss
                 continue
             rough = promised <= max(_ROUGH_FRACTION, 4 * self.least_gain) * model.deviation

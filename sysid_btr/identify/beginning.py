@@ -32,26 +32,31 @@ class Beginning:
     model: Model
 
     @cached_property
+    def _problem(self) -> ReplayProblem:
+        """With errors over the noise floor."""
+        return replace(self.study, inflation={}).train_problem(self.model).with_numerics(self.study.cheap)
+
+    @cached_property
     def _columns(self) -> FloatArray:
         """(p, r) derivatives of errors over the noise floor."""
-        plain = replace(self.study, inflation={})
-        problem = plain.train_problem(self.model).with_numerics(self.study.cheap)
-        return differences(problem, self.model.values, self.study.stencil(self.model.terms))
+        return differences(self._problem, self.model.values, self.study.stencil(self.model.terms))
+
+    @cached_property
+    def _usable(self) -> bool:
+        """Not where starts are uncertain, as whitening then depends on how columns are weighed."""
+        return len(self.model.values) > 0 and all(e.marginal is None for e in self._problem.episodes)
 
     @property
     def evaluations(self) -> int:
-        """Candidates simulated so far, at most."""
-        return 1 + len(self.model.values) if "_columns" in self.__dict__ else 0
+        """Candidates that its derivatives take; a resumed run, which may need none, counts them too."""
+        return 1 + len(self.model.values) if self._usable else 0
 
     def known(self, problem: ReplayProblem | MapProblem) -> Known | None:
-        """What is known of the derivatives of a problem whose parameters begin with those of the model.
-
-        Nothing where starts are uncertain, as whitening then depends on how columns are weighed.
-        """
+        """What is known of the derivatives of a problem whose parameters begin with those of the model."""
+        if not self._usable:
+            return None
         replays = problem.problem if isinstance(problem, MapProblem) else problem
         own, size = len(self.model.values), len(problem.start)
-        if not own or any(episode.marginal is not None for episode in replays.episodes):
-            return None
 
         def columns() -> FloatArray:
             found = np.zeros((size, replays.count))
