@@ -20,7 +20,6 @@ from sysid_btr.diagnosis.selection import STANDARD, Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial
 from sysid_btr.estimators.base import silent
-from sysid_btr.identify.beginning import Beginning
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.identify.segmented import SegmentedProcedure
@@ -110,7 +109,7 @@ def test_nothing_takes_a_place_that_is_unlikely_to_be_what_it_is_called(
     now = replace(state.fitted, model=state.fitted.model.with_(own.term(state.study.scales), own.start))
     state = replace(state, fitted=now, evidence=(Evidence(alternatives=(other,)),))
 
-    def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection, beginning: Beginning) -> Trial:
+    def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
         model = rest.with_(hypothesis.term(study.scales), hypothesis.start)
         return Trial(hypothesis, replace(now, model=model, holdout_columns=0.8 * now.holdout_columns))
 

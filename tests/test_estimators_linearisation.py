@@ -1,4 +1,4 @@
-"""What is known of derivatives: from differences, from steps, and beforehand."""
+"""What differences and steps tell of derivatives."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.estimators import Budget, Evaluator, Journal, LeastSquares, silent
-from sysid_btr.estimators.linearisation import Known, LinearModel, Pattern, Scheme, Stencil, differences, linear_model
-from sysid_btr.testing import ToyProblem, exponential_decay, run
+from sysid_btr.estimators.linearisation import LinearModel, Scheme, Stencil, linear_model
+from sysid_btr.testing import ToyProblem, run
 
 FORWARD = Scheme(Stencil.forward, central=False, rank_tolerance=1e-4)
 
@@ -80,48 +80,3 @@ def test_many_parameters_of_a_bent_problem_take_a_stencil_and_some_steps() -> No
         assert found.loss <= exact.loss * (1 + 1e-4)
         spent += found.evaluations
     assert spent < 0.8 * 8 * 91
-
-
-@pytest.mark.parametrize("right", [True, False])
-def test_derivatives_that_are_known_save_a_stencil_and_wrong_ones_are_found_out(right: bool) -> None:
-    rng = np.random.default_rng(2)
-    problem = bent(rng, 8)
-    columns = differences(problem, problem.start, 1e-4)
-    if not right:
-        columns = columns[rng.permutation(8)] * rng.standard_normal((8, 1))
-    which = np.arange(8) < 6
-    asked = []
-
-    def known() -> FloatArray:
-        asked.append(1)
-        return np.where(which[:, None], columns, np.nan)
-
-    plain = LeastSquares(confirm=False)
-    without = run(plain, problem, evaluations=None)
-    found = run(replace(plain, known=Known(which, known)), problem, evaluations=None)
-    assert asked
-    assert found.converged
-    assert found.loss == pytest.approx(without.loss, rel=1e-3)
-    if right:
-        assert found.evaluations <= without.evaluations - 6
-
-
-def test_what_is_known_beforehand_is_no_setting() -> None:
-    from sysid_btr.errors import UsageError
-    from sysid_btr.estimators import get_estimator
-
-    with pytest.raises(UsageError, match="no setting known; it has tolerance"):
-        get_estimator("lsq", known=None)
-
-
-def test_some_parameters_of_a_pattern_keep_their_groups() -> None:
-    pattern = Pattern(((0, 2), (1,), (3, 4)), lambda j: None)
-    some = pattern.of_some(np.array([True, False, True, False, True]))
-    assert some.groups == ((0, 2), (4,))
-
-
-def test_differences_are_those_of_a_decay() -> None:
-    problem = exponential_decay(np.random.default_rng(0))
-    x, h = problem.optimum, 1e-6
-    central = [(problem.residuals(x[None] + d) - problem.residuals(x[None] - d))[0] / (2 * h) for d in h * np.eye(3)]
-    np.testing.assert_allclose(differences(problem, x, 1e-6), central, atol=1e-3)

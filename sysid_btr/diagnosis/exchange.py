@@ -17,7 +17,7 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, replacements
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
-from sysid_btr.diagnosis.trials import Trial, attempt, beginning_of, is_refined
+from sysid_btr.diagnosis.trials import Trial, attempt, is_refined
 from sysid_btr.terms.effect import Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
@@ -102,9 +102,9 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     hypotheses = [h for h in hypotheses if rest.terms.admit(h.effect, h.places)]
     if not hypotheses:
         return state
-    trials, beginning = [Trial(part.hypothesis(model), state.fitted)], beginning_of(state.study, rest, rules)
-    trials += [attempt(state.study, rest, hypothesis, rules, beginning) for hypothesis in hypotheses]
-    state = state.spent(sum(t.fitted.evaluations for t in trials[1:]) + beginning.evaluations)
+    trials = [Trial(part.hypothesis(model), state.fitted)]
+    trials += [attempt(state.study, rest, hypothesis, rules) for hypothesis in hypotheses]
+    state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
     winner = preferred(rules, trials)
     if winner is not trials[0] and state.study.procedure.wanders and not is_likely(rules, state.fitted, winner, trials):
         # what is left grows in such a replay, and much would take it up: see `search`

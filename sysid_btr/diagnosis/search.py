@@ -24,7 +24,6 @@ from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import (
     Trial,
     attempt,
-    beginning_of,
     candidates_of,
     choose,
     has_law,
@@ -141,10 +140,9 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
     state = state.spent(answers)
     trials: list[Trial] = []
     waiting: list[Hypothesis] = []
-    beginning = beginning_of(state.study, state.fitted.model, rules)
 
     def tried(hypothesis: Hypothesis) -> State:
-        trial = attempt(state.study, state.fitted.model, hypothesis, rules, beginning)
+        trial = attempt(state.study, state.fitted.model, hypothesis, rules)
         trials.append(trial)
         say(f"with {hypothesis} held-out chi2 {trial.fitted.holdout:.4g}")
         return state.spent(trial.fitted.evaluations)
@@ -160,7 +158,7 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
         state = tried(hypothesis)
     while waiting and not _is_likely(state, _best(state, trials, rules), trials, rules):
         state = tried(waiting.pop(0))
-    return state.spent(beginning.evaluations), trials
+    return state, trials
 
 
 def _recorded(state: State, trials: Sequence[Trial], rules: Selection) -> State | None:

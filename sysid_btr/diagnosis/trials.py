@@ -10,7 +10,6 @@ import numpy as np
 from sysid_btr.diagnosis.closing import Candidate
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once
-from sysid_btr.identify.beginning import Beginning
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import family_of
@@ -26,18 +25,10 @@ class Trial:
     fitted: Fitted
 
 
-def beginning_of(study: Study, rest: Model, rules: Selection) -> Beginning:
-    """A model to which hypotheses are added in turn, in the part of the logs on which they are fitted."""
-    return Beginning(shorten(study, rules.refit_seconds), rest)
-
-
-def attempt(
-    study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection, beginning: Beginning | None = None
-) -> Trial:
+def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
     """The model with a hypothesis added, refitted from the best of its initial guesses.
 
-    What was fitted without it may have taken its part, so the others' nominal values are tried too. `beginning` is what
-    `beginning_of` says of the model, where several hypotheses are added to it.
+    What was fitted without it may have taken its part, so the others' nominal values are tried too.
     """
     guesses = hypothesis.initial_guesses()
     terms = rest.with_(hypothesis.term(study.scales), guesses[0]).terms
@@ -47,13 +38,7 @@ def attempt(
     spent = 0
     while True:
         start = best_start(shorten(study, seconds), terms, starts)
-        as_fitted = np.array_equal(start[: len(fitted[0])], starts[0, : len(fitted[0])])
-        found = refit(
-            shorten(study, rules.refit_seconds),
-            Model(terms, start),
-            judged=study,
-            beginning=beginning if as_fitted else None,
-        )
+        found = refit(shorten(study, rules.refit_seconds), Model(terms, start), judged=study)
         spent += found.evaluations + len(starts)
         finer = study.numerics.halved()
         given_up = not study.procedure.refines_step or finer.exact or finer.timestep < rules.finest_step

@@ -44,11 +44,6 @@ class Pattern:
             return cls(tuple((j,) for j in range(len(problem.lower))), lambda j: None)
         return cls(groups, problem.support)  # type: ignore[attr-defined]
 
-    def of_some(self, which: BoolArray) -> Pattern:
-        """The pattern of some of the parameters (p,)."""
-        some = (tuple(j for j in group if which[j]) for group in self.groups)
-        return Pattern(tuple(group for group in some if group), self.support)
-
     def group_of(self, parameter: int) -> int:
         """Index of the group a parameter belongs to."""
         return next(g for g, group in enumerate(self.groups) if parameter in group)
@@ -59,20 +54,6 @@ class Pattern:
             return change
         support = self.support(parameter)
         return change if support is None else np.where(support, change, 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """Derivatives about a point that are known beforehand, well enough to begin with.
-
-    Attributes
-    ----------
-    which : (p,) parameters whose derivatives are known.
-    columns : gives them, ``(p, r)`` per unit of each parameter; rows of others do not count.
-    """
-
-    which: BoolArray
-    columns: Callable[[], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,16 +93,13 @@ class Stencil:
         return rows
 
     def columns(self, rows: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Derivatives ``(p, r)`` per unit of the cube, and which parameters had no finite neighbour.
-
-        Rows of parameters that are not in the pattern are 0.
-        """
+        """Derivatives ``(p, r)`` per unit of the cube, and which parameters had no finite neighbour."""
         p, k = self.offsets.shape
         base = rows[0]
         columns = np.zeros((p, rows.shape[1]))
         failed = np.zeros(p, dtype=bool)
         finite = np.isfinite(rows[1:].sum(axis=1)).reshape(len(self.pattern.groups), k)
-        for j in (j for group in self.pattern.groups for j in group):
+        for j in range(p):
             g = self.pattern.group_of(j)
             usable = np.flatnonzero(finite[g])
             a = self.offsets[j, usable]
@@ -336,20 +314,13 @@ def linearise(problem: Problem, x: FloatArray, *, step: float = CENTRAL_STEP) ->
 
 
 def linear_model(
-    problem: ResidualProblem,
-    evaluator: Evaluator,
-    u: FloatArray,
-    steps: FloatArray,
-    scheme: Scheme,
-    note: str,
-    known: Known | None = None,
+    problem: ResidualProblem, evaluator: Evaluator, u: FloatArray, steps: FloatArray, scheme: Scheme, note: str
 ) -> tuple[LinearModel, FloatArray]:
     """The model about `u`, and the finite-difference steps for the next one."""
-    pattern = Pattern.of(problem)
-    if known is not None:
-        pattern = pattern.of_some(~known.which)
     for _ in range(3):
-        model = _simulate_stencil(problem, evaluator, scheme.stencil(u, steps, pattern), known, scheme.central, note)
+        model = _simulate_stencil(
+            problem, evaluator, scheme.stencil(u, steps, Pattern.of(problem)), keep=scheme.central, note=note
+        )
         # A failed neighbour: look closer, and on the other side.
         closer = np.where(model.failed, -0.25 * steps, steps)
         size = np.abs(closer)
@@ -361,19 +332,14 @@ def linear_model(
 
 
 def _simulate_stencil(
-    problem: ResidualProblem, evaluator: Evaluator, stencil: Stencil, known: Known | None, keep: bool, note: str
+    problem: ResidualProblem, evaluator: Evaluator, stencil: Stencil, *, keep: bool, note: str
 ) -> LinearModel:
     points = stencil.candidates()
-    candidates, p = evaluator.box.leave(points), len(stencil.base)
-
-    def differences(rows: FloatArray) -> tuple[FloatArray, BoolArray]:
-        columns, failed = stencil.columns(rows)
-        if known is not None:
-            columns[known.which] = (known.columns() * evaluator.box.span[:, None])[known.which]
-        return np.vstack([columns, rows[:1]]), failed
+    candidates = evaluator.box.leave(points)
 
     def reduction(rows: FloatArray) -> tuple[dict[str, FloatArray], FloatArray | None]:
-        stack, failed = differences(rows)
+        columns, failed = stencil.columns(rows)
+        stack = np.vstack([columns, rows[:1]])
         # einsum, not BLAS: the same bits whatever the number of threads.
         gram = np.einsum("ir,jr->ij", stack, stack)
         arrays = {"gram": gram, "failed": failed.astype(np.float64), "size": np.array([float(rows.shape[1])])}
@@ -383,10 +349,14 @@ def _simulate_stencil(
         stack[:-1][failed] = np.nan
         return arrays, stack
 
-    def make() -> FloatArray:
-        return reduced.attachment() if keep else differences(evaluator.again(problem.residuals, candidates))[0]
+    made = Stack(lambda: reduced.attachment() if keep else again())
 
-    made, shapes = Stack(make), {"gram": (p + 1, p + 1), "failed": (p,), "size": (1,)}
+    def again() -> FloatArray:
+        rows = evaluator.again(problem.residuals, candidates)
+        return np.vstack([stencil.columns(rows)[0], rows[:1]])
+
+    p = len(candidates[0])
+    shapes = {"gram": (p + 1, p + 1), "failed": (p,), "size": (1,)}
     reduced = evaluator.reduce(problem, candidates, reduction, note, shapes)
     gram, failed = reduced.arrays["gram"], reduced.arrays["failed"] > 0.0
     change = np.sqrt(np.diag(gram)[:-1]) * np.abs(stencil.offsets).max(axis=1)
@@ -403,22 +373,7 @@ def _simulate_stencil(
         least_deviation=float(getattr(problem, "deviation", 0.0)),
         neighbour=(np.clip(points[nearest], 0.0, 1.0), float(reduced.loss[nearest])),
         stack=made,
-        measured=known is None,
     )
-
-
-def differences(problem: ResidualProblem, x: FloatArray, step: float) -> FloatArray:
-    """Derivatives (p, r) per unit of each parameter by forward differences; 0 where a neighbour fails.
-
-    Parameters
-    ----------
-    problem, x : see `linearise`.
-    step : fraction of each parameter's range.
-    """
-    box = UnitBox(problem.lower, problem.upper)
-    u = box.enter(x)
-    stencil = Stencil.forward(u, np.full(len(u), step), Pattern.of(problem))
-    return stencil.columns(problem.residuals(box.leave(stencil.candidates())))[0] / box.span[:, None]
 
 
 def unpack(model: LinearModel, box: UnitBox) -> tuple[FloatArray, FloatArray]:

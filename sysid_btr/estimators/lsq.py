@@ -14,7 +14,7 @@ spectrum, so parameters that are confounded stay where they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -35,7 +35,6 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.linearisation import (
     CENTRAL_STEP,
     WIDEST_STEP,
-    Known,
     LinearModel,
     Neighbour,
     Scheme,
@@ -55,7 +54,6 @@ _SLOW_FRACTION = 0.5  # a step that gains less than this, in the same unit ...
 _MANY = 1000  # residuals, from which on their mean square says what noise is
 _KEPT = 0.1  # ... and less than this share of what it promised tells of a rough objective, not of a way to go
 _KEEPS = 0.25  # of what it promised: a step that gains less is too long (Nocedal and Wright 2006, algorithm 4.1)
-_TELLS = 0.75  # the same of derivatives that are not of this very point: the step is a good one (ibid.)
 _LOSS_MISMATCH = 1e-6
 _STEPS = 4  # at most for each stencil
 _FAR = 0.1  # of the loss: steps that gained more end at differences of their own
@@ -117,8 +115,6 @@ class LeastSquares:
     least_gain
         Decrease of the loss, in mean squared residuals, that is worth a step: 0.01 is a tenth of a standard
         deviation. More where the objective is rough.
-    known
-        Derivatives that need no simulation to begin with.
 
     Notes
     -----
@@ -140,7 +136,6 @@ class LeastSquares:
     prescreen: int = 8
     confirm: bool = True
     least_gain: float = _STD_FRACTION
-    known: Known | None = field(default=None, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or self.n_starts < 1 or self.prescreen < 1:
@@ -251,8 +246,7 @@ class LeastSquares:
                 if stencils == self.max_iterations:
                     break
                 stencils += 1
-                known = self.known if stencils == 1 and not scheme.central else None
-                model, steps = linear_model(problem, evaluator, u, steps, scheme, note, known)
+                model, steps = linear_model(problem, evaluator, u, steps, scheme, note)
                 _require_consistent(loss, model.loss)
                 moved = 0.0
             full = model.step(0.0, -u, 1.0 - u, scheme.rank_tolerance)
@@ -269,10 +263,10 @@ class LeastSquares:
                 return _Point(u, loss, steps, Termination.STALLED if model.failed.any() else there, model)
             found = _climb(evaluator, problem, model, u, loss, scheme, ladder, promised, note)
             gained = 0.0 if found is None else loss - found.loss
-            if not model.measured and gained < _TELLS * promised:
-                # derivatives that are not these are not enough; what was known beforehand may be of another valley
+            if not model.measured and gained < _KEEPS * promised:
+                # what steps showed of the derivatives is not enough here
                 model = None
-                if found is not None and moved > 0.0:
+                if found is not None:
                     u, loss = found.u, found.loss
                 continue
             rough = promised <= max(_ROUGH_FRACTION, 4 * self.least_gain) * model.deviation

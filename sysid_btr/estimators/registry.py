@@ -81,7 +81,7 @@ def _chain(name: str, settings: Mapping[str, Any]) -> Estimator:
 def _check_settings(name: str, factory: Factory, settings: Mapping[str, Any]) -> None:
     if not is_dataclass(factory):
         return
-    known = [field.name for field in fields(factory) if field.metadata.get("setting", True)]
+    known = [field.name for field in fields(factory)]
     wrong = [key for key in settings if key not in known]
     if wrong:
         raise UsageError(f"estimator {name!r} has no setting {', '.join(wrong)}; it has {', '.join(known)}")

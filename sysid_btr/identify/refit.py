@@ -12,7 +12,6 @@ from sysid_btr.estimators.base import Budget, FitResult, Progress, Termination, 
 from sysid_btr.estimators.evaluator import Evaluator, Stop
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
-from sysid_btr.identify.beginning import Beginning
 from sysid_btr.identify.deferred import LEAST_GAIN, deferred_fit
 from sysid_btr.identify.prior import Stated
 from sysid_btr.identify.study import Study
@@ -107,14 +106,12 @@ def refit(
     budget: Budget | None = None,
     progress: Progress = silent,
     judged: Study | None = None,
-    beginning: Beginning | None = None,
 ) -> Fitted:
     """Least squares that begin at a model; `polish` runs to convergence with central differences.
 
     `judged` is the study whose data say how good the result is, where that is not the one that is fitted. What a model
     states of its masses counts beside the errors that the study's columns are weighed by; where the model leaves much
-    less, it is refitted beside its own. `beginning` is a model that this one has all parameters of, first and as they
-    are there.
+    less, it is refitted beside its own.
 
     Raises
     ------
@@ -123,7 +120,7 @@ def refit(
     """
     budget, spent = budget or Budget(), 0
     for _ in range(RELIEFS):
-        result = _minimised(study, model, polish, iterations, budget.after(spent), progress, beginning)
+        result = _minimised(study, model, polish, iterations, budget.after(spent), progress)
         model, spent = model.at(result.x), spent + result.evaluations
         found = judge(judged or study, model, evaluations=spent)
         if not Stated.of(model.terms.parameters, study.redundancy).weight.any():
@@ -141,13 +138,7 @@ def _is_relieved(study: Study, own: Study) -> bool:
 
 
 def _minimised(
-    study: Study,
-    model: Model,
-    polish: bool,
-    iterations: int,
-    budget: Budget,
-    progress: Progress,
-    beginning: Beginning | None,
+    study: Study, model: Model, polish: bool, iterations: int, budget: Budget, progress: Progress
 ) -> FitResult:
     """Least squares as the study's columns are weighed."""
     problem = study.with_belief(study.train_problem(model.clipped()))
@@ -156,7 +147,6 @@ def _minimised(
         max_iterations=30 if polish else iterations,
         tolerance=1e-6 if polish else TOLERANCE,
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
-        known=None if beginning is None else beginning.known(problem),
     )
     structural, step = model.terms.structural, study.stencil(model.terms)
     estimator = study.procedure.suited(estimator)
