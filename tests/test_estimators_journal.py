@@ -202,7 +202,7 @@ def test_least_squares_resumes_from_every_record(tmp_path: Path) -> None:
             run(estimator, witness, journal=Journal(path))
         again = Witness(problem)
         resumed = run(estimator, again, journal=Journal(path))
-        assert again.goes_on(witness, reference, again=1)
+        assert again.goes_on(witness, len(witness.answered), reference, again=1)
         assert resumed.jacobian is not None
         assert resumed.jacobian.tobytes() == whole.jacobian.tobytes()
 

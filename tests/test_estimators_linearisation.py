@@ -44,7 +44,7 @@ def test_a_step_is_explained_by_derivatives_that_change_no_more_than_they_must(s
     problem = bent(rng, p)
     evaluator, u, model = about(problem)
     to = np.clip(u + 0.3 * rng.standard_normal(p), 0.0, 1.0)
-    (neighbour,) = model.at(evaluator, problem, to[None], "")
+    (neighbour,) = model.neighbours(evaluator, problem, to[None], "")
     moved = model.moved(u, neighbour)
     assert moved is not None
     assert not moved.measured
@@ -64,7 +64,7 @@ def test_a_step_is_explained_by_derivatives_that_change_no_more_than_they_must(s
 def test_a_step_from_where_a_neighbour_failed_tells_nothing_of_it() -> None:
     problem = bent(np.random.default_rng(0), 3)
     evaluator, u, model = about(problem)
-    (neighbour,) = model.at(evaluator, problem, u[None] + 0.01, "")
+    (neighbour,) = model.neighbours(evaluator, problem, u[None] + 0.01, "")
     assert replace(model, failed=np.array([False, True, False])).moved(u, neighbour) is None
 
 

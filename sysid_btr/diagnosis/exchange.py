@@ -17,7 +17,7 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, replacements
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
-from sysid_btr.diagnosis.trials import Trial, attempt, is_refined
+from sysid_btr.diagnosis.trials import Trial, attempt, near_best
 from sysid_btr.terms.effect import Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
@@ -163,9 +163,7 @@ def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:
 def preferred(rules: Selection, trials: Sequence[Trial]) -> Trial:
     """The first of several trials, unless another predicts held-out data better, or as well and is simpler."""
     own = trials[0]
-    finite = [t for t in trials if np.isfinite(t.fitted.holdout)]
-    best = min(finite, key=lambda t: t.fitted.misfit)
-    near = [t for t in finite if t.fitted.misfit <= best.fitted.misfit + rules.simpler or is_refined(rules, t, best)]
+    near = near_best(rules, [t for t in trials if np.isfinite(t.fitted.holdout)])
     if own in near:
         near = [t for t in near if t is own or t.hypothesis.complexity < own.hypothesis.complexity]
     return min(near, key=lambda t: (t.hypothesis.complexity, t is not own, t.fitted.misfit))

@@ -138,8 +138,7 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
     def order(trial: Trial) -> tuple[int, float]:
         return trial.hypothesis.complexity, trial.fitted.misfit
 
-    best = min(trials, key=lambda t: t.fitted.misfit)
-    near = [t for t in trials if t.fitted.misfit <= best.fitted.misfit + rules.simpler or is_refined(rules, t, best)]
+    near = near_best(rules, trials)
     named = {t.hypothesis.effect.name for t in near}
     near = [t for t in near if not named & set(t.hypothesis.effect.yields_to)]
     simplest = min(near, key=order)
@@ -148,7 +147,13 @@ def _simplest(rules: Selection, trials: Sequence[Trial]) -> Trial:
     return min([t for t in better if paired_t(t.fitted, simplest.fitted) > rules.t] or [simplest], key=order)
 
 
-def is_refined(rules: Selection, simple: Trial, best: Trial) -> bool:
+def near_best(rules: Selection, trials: Sequence[Trial]) -> list[Trial]:
+    """Of several trials those that predict about as well as the best, and simpler forms that it beats as chance may."""
+    best = min(trials, key=lambda t: t.fitted.misfit)
+    return [t for t in trials if t.fitted.misfit <= best.fitted.misfit + rules.simpler or _is_refined(rules, t, best)]
+
+
+def _is_refined(rules: Selection, simple: Trial, best: Trial) -> bool:
     """Whether the best form of a family has more numbers than another at its locations, and beats it as chance may.
 
     Curves have a rule of their own, see `has_law`.

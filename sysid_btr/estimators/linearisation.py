@@ -194,7 +194,7 @@ class LinearModel:
             b = np.append(b, np.zeros(len(scale)))
         return np.clip(_bounded_least_squares(a, b, low * scale, high * scale) / scale, low, high)
 
-    def at(
+    def neighbours(
         self, evaluator: Evaluator, problem: ResidualProblem, points: FloatArray, note: str
     ) -> tuple[Neighbour, ...]:
         """Candidates ``(m, p)`` of the unit cube, simulated, with what a step there tells of the derivatives."""

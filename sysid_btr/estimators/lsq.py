@@ -55,8 +55,8 @@ _MANY = 1000  # residuals, from which on their mean square says what noise is
 _KEPT = 0.1  # ... and less than this share of what it promised tells of a rough objective, not of a way to go
 _KEEPS = 0.25  # of what it promised: a step that gains less is too long (Nocedal and Wright 2006, algorithm 4.1)
 _LOSS_MISMATCH = 1e-6
-_STEPS = 4  # at most for each stencil
-_FAR = 0.1  # of the loss: steps that gained more end at differences of their own
+_STEPS = 4  # for each stencil that is allowed, at most
+_FAR = 0.1  # of the loss: where steps since the last stencil gained more, the end has one of its own
 _FIRST_DAMPING = 0.1
 
 
@@ -239,7 +239,7 @@ class LeastSquares:
         scheme: Scheme,
     ) -> _Point:
         ladder, slow, halted = self._ladder(_FIRST_DAMPING, trust=False), 0, Termination.STALLED
-        model, moved, stencils = None, 0.0, 0
+        model, since, stencils = None, 0.0, 0
         for iteration in range(1, _STEPS * self.max_iterations + 1):
             note = f"iteration {iteration}"
             if model is None:
@@ -248,7 +248,7 @@ class LeastSquares:
                 stencils += 1
                 model, steps = linear_model(problem, evaluator, u, steps, scheme, note)
                 _require_consistent(loss, model.loss)
-                moved = 0.0
+                since = 0.0
             full = model.step(0.0, -u, 1.0 - u, scheme.rank_tolerance)
             promised = model.predicted(full)
             # of correlated residuals, which count less, a standard deviation is more than their mean square
@@ -256,7 +256,7 @@ class LeastSquares:
             tolerance *= max(1.0, model.deviation * model.residuals / max(loss, np.finfo(float).tiny))
             short = bool(np.max(np.abs(full)) < self.step_tolerance)
             if short or promised <= tolerance * loss or slow == 2:
-                if moved > _FAR * loss:
+                if since > _FAR * loss:
                     model = None
                     continue
                 there = halted if slow == 2 else Termination.CONVERGED
@@ -285,7 +285,7 @@ class LeastSquares:
                 return _Point(u, loss, steps, halted, model)
             told = found.neighbour if gained >= _KEEPS * promised else None
             model = None if told is None else model.moved(u, told)
-            u, loss, moved = found.u, found.loss, moved + gained
+            u, loss, since = found.u, found.loss, since + gained
             if slow == 2 and not scheme.central:
                 return _Point(u, loss, steps, halted)
         return _Point(u, loss, steps, Termination.ITERATION_LIMIT)
@@ -340,7 +340,7 @@ def _climb(
             continue
         steps = [model.step(float(factor), -u, 1.0 - u, scheme.rank_tolerance) for factor in factors]
         trials = np.clip(u + np.array(steps), 0.0, 1.0)
-        near = () if scheme.central else model.at(evaluator, problem, trials, note)
+        near = () if scheme.central else model.neighbours(evaluator, problem, trials, note)
         losses = np.array([n.loss for n in near]) if near else evaluator.loss(evaluator.box.leave(trials), note)
         i = int(np.argmin(losses))
         if losses[i] < (loss if found is None else found.loss):

@@ -184,13 +184,14 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[
     if not laws:
         return [None] * candidates
     # imports what compiles laws, which takes a second
-    from sysid_btr.simulation.laws import side_by_side, table_of
+    from sysid_btr.simulation.laws import numbers_of_many, side_by_side, table_of
     from sysid_btr.simulation.stepping import Samples, on_samples
 
     table, numbers, awake = table_of(laws, candidates)
     n, joints = motion.position.shape
-    # laws of a place each take all samples at once; others, which may join places, sample by sample
-    together = n if all(table.rows == np.diff(table.place)) else 1
+    # laws of a place each take all samples at once; where one joins drives, all go sample by sample
+    together = 1 if any(law.term.scope == "robot" for law in laws) else n
+    many = side_by_side(table, joints, together)
 
     def wide(values: FloatArray) -> FloatArray:
         return np.ascontiguousarray(values).reshape(-1, together * joints)
@@ -200,8 +201,9 @@ def _acting(laws: tuple[Law, ...], motion: Kinematics, candidates: int) -> list[
     def act(candidate: int, dry: FloatArray, smooth: FloatArray, load: FloatArray, torque: FloatArray) -> None:
         # friction may follow the torque of the servo: the predicted one, as the measured would explain itself
         samples = Samples(position, velocity, direction, wide(smooth), wide(load))
-        many, own = side_by_side(table, numbers[candidate], joints, together)
-        on_samples(many, own, awake[candidate], motion.period, ROUNDS, samples, np.tile(dry, together), wide(torque))
+        own, found = numbers_of_many(table, numbers[candidate], together), wide(torque)
+        on_samples(many, own, awake[candidate], motion.period, ROUNDS, samples, np.tile(dry, together), found)
+        torque[:] = found.reshape(torque.shape)
 
     return [partial(act, i) if awake[i].any() else None for i in range(candidates)]
 

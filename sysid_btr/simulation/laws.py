@@ -71,26 +71,21 @@ def table_of(laws: Sequence[Law], candidates: int) -> tuple[Laws, FloatArray, Bo
     return table, flat, awake
 
 
-def side_by_side(laws: Laws, numbers: FloatArray, joints: int, count: int) -> tuple[Laws, FloatArray]:
-    """Laws (n,) and one candidate's numbers (k,) for a robot that is there so many times, its joints one after another.
-
-    Of laws that have a row for each place, and so act on each by itself, and no memory.
-    """
-    own = [
-        np.tile(numbers[a:b].reshape(rows, -1), (count, 1)).ravel()
-        for a, b, rows in zip(laws.number[:-1], laws.number[1:], laws.rows, strict=True)
-    ]
+def side_by_side(laws: Laws, joints: int, count: int) -> Laws:
+    """Laws of places, without memory, of a robot that is there so many times, its joints one after another."""
     places = [
         (laws.places[a:b] + joints * np.arange(count)[:, None]).ravel()
         for a, b in zip(laws.place[:-1], laws.place[1:], strict=True)
     ]
-    many = laws._replace(
-        rows=laws.rows * count,
-        number=laws.number * count,
-        place=laws.place * count,
-        places=_whole(np.concatenate([np.zeros(0), *places])),
+    return laws._replace(
+        rows=laws.rows * count, number=laws.number * count, place=laws.place * count, places=np.concatenate(places)
     )
-    return many, np.concatenate([np.zeros(0), *own])
+
+
+def numbers_of_many(laws: Laws, numbers: FloatArray, count: int) -> FloatArray:
+    """One candidate's numbers (k,) of laws as `side_by_side` has them: (k count,)."""
+    ends = zip(laws.number[:-1], laws.number[1:], strict=True)
+    return np.concatenate([np.tile(numbers[a:b], count) for a, b in ends])
 
 
 def _whole(values: Any) -> IntArray:

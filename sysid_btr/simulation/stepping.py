@@ -502,14 +502,11 @@ def _on_samples(
     rows[VOLTAGE], rows[ENABLED] = np.nan, 1.0
     step, before, excess = step_of(0.0, period, rows), np.zeros(len(dry)), np.zeros(len(dry))
     for i in range(len(torque)):
-        # number by number: numba takes longer over a short row as a whole
-        for j in range(len(dry)):
-            rows[COMMAND, j] = rows[QPOS, j] = samples.position[i, j]
-            rows[QVEL, j], rows[LOAD, j] = samples.velocity[i, j], samples.load[i, j]
+        rows[COMMAND], rows[QPOS], rows[QVEL] = samples.position[i], samples.position[i], samples.velocity[i]
+        rows[LOAD] = samples.load[i]
         for k in range(rounds):
-            for j in range(len(dry)):
-                rows[TORQUE, j], rows[GAIN, j], rows[LOW, j], rows[HIGH, j] = torque[i, j], 1.0, -np.inf, np.inf
-                rows[MOTOR, j] = rows[JOINT, j] = rows[FRICTION, j] = 0.0
+            rows[TORQUE], rows[GAIN], rows[LOW], rows[HIGH] = torque[i], 1.0, -np.inf, np.inf
+            rows[MOTOR], rows[JOINT], rows[FRICTION] = 0.0, 0.0, 0.0
             apply_laws(laws, numbers, awake, memory, step)
             settled = True
             for j in range(len(dry)):

@@ -96,14 +96,21 @@ class Witness(Derived):
         """All candidates, bit by bit."""
         return b"".join(candidate.tobytes() for candidate in self.answered)
 
-    def goes_on(self, earlier: Witness, whole: Witness, *, again: int) -> bool:
-        """Whether it was asked what `earlier` lacked of `whole`, in order, and what it had each `again` times at most.
+    def goes_on(self, earlier: Witness, kept: int, whole: Witness, *, again: int) -> bool:
+        """Whether `earlier` began as `whole` did, and this was asked the rest, in order.
 
-        An estimator of residuals may need arrays of candidates that were simulated, which a journal does not hold.
+        Parameters
+        ----------
+        earlier, kept : what was asked before, and how many of these candidates the journal holds.
+        whole : what is asked without interruption.
+        again : how often each of those that it holds may be asked again in between: an estimator of residuals may
+            need arrays of them, which a journal does not hold.
         """
-        had, rest = ([c.tobytes() for c in part] for part in (earlier.answered, whole.answered))
-        rest = rest[len(had) :]
-        repeated = Counter({candidate: again * count for candidate, count in Counter(had).items()})
+        had, every = ([c.tobytes() for c in part] for part in (earlier.answered, whole.answered))
+        if had != every[: len(had)]:
+            return False
+        rest = every[kept:]
+        repeated = Counter({candidate: again * count for candidate, count in Counter(had[:kept]).items()})
         for candidate in (c.tobytes() for c in self.answered):
             if rest and candidate == rest[0]:
                 rest = rest[1:]
@@ -293,7 +300,7 @@ def check_interruption(estimator: Estimator) -> None:
         resumed = run(estimator, again, journal=journal)
         require(_same(resumed, whole), f"{estimator.name}: resumed after Ctrl-C, the answer changed")
         require(
-            again.goes_on(witness, reference, again=_repeats(estimator)),
+            again.goes_on(witness, len(witness.answered), reference, again=_repeats(estimator)),
             f"{estimator.name}: resumed after Ctrl-C, evaluations were repeated or skipped",
         )
 
@@ -329,12 +336,11 @@ def _check_one_resume(
         raise AssertionError(where + "it swallowed an exception that was not its own")
     if torn and path.exists():
         path.write_bytes(path.read_bytes()[:-torn])
-    again = Witness(reference.problem)
+    again, kept = Witness(reference.problem), Journal(path).evaluations
     resumed = run(estimator, again, journal=Journal(path))
     require(_same(resumed, whole), where + "resumed, the answer changed")
-    # of a torn record all is simulated again
-    repeats = _repeats(estimator) + (1 if torn else 0)
-    require(again.goes_on(witness, reference, again=repeats), where + "evaluations were repeated or skipped")
+    went_on = again.goes_on(witness, kept, reference, again=_repeats(estimator))
+    require(went_on, where + "evaluations were repeated or skipped")
 
 
 def _repeats(estimator: Estimator) -> int:
