@@ -30,6 +30,7 @@ from sysid_btr.diagnosis.trials import (
     is_hopeless,
     is_outdone,
     is_superfluous,
+    of_a_special_case,
 )
 from sysid_btr.estimators.base import Budget, Progress
 from sysid_btr.identify.bounds import fit_beyond
@@ -77,6 +78,8 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             state = recorded
             continue
         winner = _best(state, trials, rules)
+        if winner is not None:
+            state, winner, trials = _simplified(state, winner, trials, library, rules)
         floating = state.study.procedure.leaves_ground_error
         explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
         likely = _is_likely(state, winner, trials, rules)
@@ -121,6 +124,14 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
 
 def _best(state: State, trials: Sequence[Trial], rules: Selection) -> Trial | None:
     return choose(rules, state.fitted, [t for t in trials if _is_worthy(rules, state, t)])
+
+
+def _simplified(
+    state: State, winner: Trial, trials: list[Trial], library: Library, rules: Selection
+) -> tuple[State, Trial, list[Trial]]:
+    """The winner of a round as the special case of its law that will do for now, one of all trials."""
+    simple, spent = of_a_special_case(state.study, state.fitted, winner, library, rules)
+    return state.spent(spent), simple, trials if simple is winner else [*trials, simple]
 
 
 def _is_likely(state: State, winner: Trial | None, trials: Sequence[Trial], rules: Selection) -> bool:

@@ -139,7 +139,7 @@ class Selection:
     Judgement."""
     law: float = 0.5
     """Fraction of what a curve that is learnt explains, from which a law at its place comes first: most of it. The law
-    says more, and a curve can still take up the rest. Judgement."""
+    says more, and a curve can still take up the rest. The same for a law and a special case of it. Judgement."""
     law_if_periodic: float = 0.9
     """The same for a curve that is periodic in time and a law of its family, nearly all of it: pulses at its frequency
     explain 81 % of a sine, and what they leave asks for others beside. Judgement."""

@@ -12,9 +12,10 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
-from sysid_btr.terms.effect import family_of
+from sysid_btr.terms.effect import Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS, FreeCurve
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.scales import scale_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +177,34 @@ def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner
     gain = before.holdout - winner.fitted.holdout
     laws = [t for t in laws if before.holdout - t.fitted.holdout >= enough * gain]
     return _simplest(rules, laws) if laws else winner
+
+
+def of_a_special_case(
+    study: Study, before: Fitted, trial: Trial, library: Sequence[type[Effect]], rules: Selection
+) -> tuple[Trial, int]:
+    """A trial with a simpler law that its own includes, if that will do for now; and what that took.
+
+    What is still missing is left by a simple law, and one with more numbers takes up some of it: while more is left
+    than the two differ by, the simple one goes first. Where it is not enough the other follows it.
+    """
+    effect, places = trial.hypothesis.effect, trial.hypothesis.places
+    left, gain = trial.fitted.holdout - 1, before.holdout - trial.fitted.holdout
+    if effect in FREE_FORMS or at_floor(rules, trial.fitted):
+        return trial, 0
+    spent, simpler = 0, list[Trial]()
+    for kind in library:
+        if (kind.label or kind.name) not in effect.includes or len(kind.kinds) >= len(effect.kinds):
+            continue
+        there = tuple(p for p in places if p in study.robot.names(kind.scope) and before.model.terms.admit(kind, [p]))
+        if not there:
+            continue
+        start = np.concatenate([kind.probes(scale_at(study.scales, p))[0][0] for p in there])
+        found = attempt(study, before.model, Hypothesis(kind, there, False, start, trial.hypothesis.gain), rules)
+        spent += found.fitted.evaluations
+        lost = found.fitted.holdout - trial.fitted.holdout
+        if lost < min(left, (1 - rules.law) * gain):
+            simpler.append(found)
+    return min(simpler, key=lambda t: t.fitted.misfit, default=trial), spent
 
 
 def _is_another(hypothesis: Hypothesis, simple: Hypothesis) -> bool:

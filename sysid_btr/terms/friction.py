@@ -279,7 +279,7 @@ class LoadFrictionPower(LoadFriction):
     """Friction that grows with a power of the load, as at contacts that flatten under it.
 
     Two thirds for a sphere on a plane (Bowden and Tabor 1950, "The Friction and Lubrication of Solids"); two where a
-    gear is less efficient, the harder it is driven. Its torque is that at a load which is usual for the robot, where
+    gear is less efficient, the harder it is driven; by none it is dry friction. Its torque is that at a load which is usual for the robot, where
     motion tells it apart from the exponent.
 
     Law: torque (|T| / L)^exponent, with T the servo's torque at the middle of each step and L the median over joints of
@@ -291,10 +291,10 @@ class LoadFrictionPower(LoadFriction):
     label: ClassVar[str] = "load_friction.power"
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("torque", "Nm", 0.0, 0.0, 10.0, 0.1),
-        Kind("exponent", "1", 1.0, 0.2, 3.0, 0.1),
+        Kind("exponent", "1", 1.0, 0.0, 3.0, 0.1),
     )
     held: ClassVar[tuple[str, ...]] = ("exponent",)
-    includes: ClassVar[tuple[str, ...]] = ("load_friction",)
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction", "load_friction")
 
     @classmethod
     def sized(cls, scale: JointScale) -> tuple[Kind, ...]:
