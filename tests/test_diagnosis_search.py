@@ -8,6 +8,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+import toys
+from test_diagnosis_close import OTHERWISE, TOY_FIT, Plant, motion, seen_by_encoders
 from test_segmented import double_pendulum, driven
 
 from sysid_btr.diagnosis import exchange as exchange_module
@@ -18,15 +20,16 @@ from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
 from sysid_btr.diagnosis.state import State
-from sysid_btr.diagnosis.trials import Trial
+from sysid_btr.diagnosis.trials import Trial, attempt, of_a_special_case
 from sysid_btr.estimators.base import silent
 from sysid_btr.identify.fit import fit
-from sysid_btr.identify.refit import Fitted
+from sysid_btr.identify.numerics import TOLERATED
+from sysid_btr.identify.refit import Fitted, inflate, judge, refit
 from sysid_btr.identify.segmented import SegmentedProcedure
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.friction import CoulombFriction, QuadraticDamping, ViscousDamping
+from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionPower, QuadraticDamping, ViscousDamping
 from sysid_btr.terms.model import Model
 
 ORDER: tuple[type[Effect], ...] = (CoulombFriction, ViscousDamping, QuadraticDamping)
@@ -118,3 +121,85 @@ def test_nothing_takes_a_place_that_is_unlikely_to_be_what_it_is_called(
     monkeypatch.setattr(SegmentedProcedure, "wanders", wanders)
     found = exchange(state, ORDER, STANDARD)
     assert [type(e) for e in found.effects] == [ORDER[1] if taken else ORDER[0]]
+
+
+# --- a special case first ----------------------------------------------------------------------------------
+
+
+@cache
+def rubbing(exponent: float, spring: float) -> State:
+    """A leg whose knee rubs by a power of its load, and whose hip may have a spring too, both undeclared."""
+    sprung = toys.with_spec(toys.leg(), lambda spec: setattr(spec.joint("hip"), "stiffness", [spring, 0.0, 0.0]))
+    plant = Plant(LoadFrictionPower(("knee",), ranges=((0.0, 1.0),)), (0.15, exponent))
+    log = seen_by_encoders(plant, motion(), OTHERWISE, robot=sprung)
+    return State.of(fit(make_study(toys.leg(), [log], numerics=toys.FINE, threads=1), TOY_FIT), None)
+
+
+@pytest.mark.parametrize(
+    ("exponent", "spring", "first"),
+    [
+        (0.0, 1.5, CoulombFriction),  # what the spring leaves no exponent should follow
+        (0.3, 1.5, CoulombFriction),
+        (1.0, 1.5, LoadFriction),
+        (0.5, 0.0, LoadFrictionPower),  # nothing else is missing: the exponent is what the log shows
+    ],
+)
+def test_a_special_case_goes_first_while_more_is_left_than_its_law_would_take(
+    exponent: float, spring: float, first: type[Effect]
+) -> None:
+    state = rubbing(exponent, spring)
+    power = Hypothesis(LoadFrictionPower, ("knee",), False, np.array([0.1, 0.8]), 1.0)
+    trial = attempt(state.study, state.fitted.model, power, STANDARD)
+    library = (CoulombFriction, ViscousDamping, LoadFriction, LoadFrictionPower)
+    simple, spent = of_a_special_case(state.study, state.fitted, trial, library, STANDARD)
+    assert simple.hypothesis.effect is first
+    assert (spent > 0) == (spring > 0)
+    if first is not LoadFrictionPower:
+        assert simple.fitted.holdout - trial.fitted.holdout < trial.fitted.holdout - 1
+
+
+def test_a_special_case_is_not_added_where_it_is_already() -> None:
+    state = rubbing(0.0, 1.5)
+    rubs = state.fitted.model.with_(CoulombFriction(("knee",)), np.array([0.15]))
+    before = judge(state.study, rubs)
+    power = Hypothesis(LoadFrictionPower, ("knee",), False, np.array([0.1, 1.0]), 1.0)
+    trial = attempt(state.study, rubs, power, STANDARD)
+    assert of_a_special_case(state.study, before, trial, (CoulombFriction,), STANDARD) == (trial, 0)
+
+
+# --- steps as long as what is left allows -------------------------------------------------------------------
+
+
+def moved(study: Study, model: Model, one: Numerics, other: Numerics) -> float:
+    """By how much steps differ: the largest rms over columns, in errors that are left."""
+    problem = study.train_problem(model)
+    first, second = (problem.with_numerics(n).residuals(model.values[None])[0] for n in (one, other))
+    square = np.bincount(problem.column_labels, (first - second) ** 2, len(problem.columns)) / problem.counts
+    return float(np.sqrt(square.max()))
+
+
+def test_steps_are_longer_while_much_is_left_and_end_as_the_parameters_were_fitted() -> None:
+    log = seen_by_encoders(Plant(CoulombFriction(("knee",)), (0.3,)), motion(), OTHERWISE)
+    study = make_study(toys.leg(), [log], numerics=Numerics("RK4", 0.000625), threads=1)
+    state = State.of(fit(study, ["mass:knee"]), None)
+    finest = state.study.numerics
+    coarse = state.in_longest_steps()
+    assert finest.timestep < coarse.study.numerics.timestep <= 0.010
+    assert moved(state.study, state.fitted.model, finest, coarse.study.numerics) < 2 * TOLERATED
+    assert coarse.fitted.holdout == pytest.approx(state.fitted.holdout, rel=0.02)
+    again = coarse.in_first_steps()
+    assert again.study.numerics == finest
+    assert again.fitted.holdout == state.fitted.holdout
+    # the better the model, the shorter its steps
+    rubs = refit(state.study, state.fitted.model.with_(CoulombFriction(("knee",)), np.array([0.3])))
+    right = replace(state, study=inflate(state.study, rubs), fitted=rubs).in_longest_steps()
+    assert right.study.numerics.timestep < coarse.study.numerics.timestep
+
+
+@pytest.mark.parametrize(
+    "numerics", [Numerics("RK4", 0.000625, stated=True), Numerics("Euler", 0.001), Numerics("RK4", 0.001, 0.004)]
+)
+def test_steps_that_are_part_of_the_model_stay(numerics: Numerics) -> None:
+    log = seen_by_encoders(Plant(CoulombFriction(("knee",)), (0.3,)), motion(), OTHERWISE)
+    state = State.of(fit(make_study(toys.leg(), [log], numerics=numerics, threads=1), ["mass:knee"]), None)
+    assert state.in_longest_steps().study.numerics == numerics

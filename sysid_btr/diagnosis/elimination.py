@@ -37,14 +37,14 @@ SETTLED = 0.01
 
 def eliminate(state: State, library: Library, rules: Selection, progress: Progress) -> State:
     """The model with only those effects that data want, at the optimum and with intervals."""
-    state = _pruned(state, rules)
+    state = _pruned(state.in_longest_steps(), rules)
     if not state.effects:
-        return state
+        return state.in_first_steps()
     joined = as_curves(state, library, rules)
     # what took up the errors of their form goes with them
     state = state if joined is state else _pruned(joined, rules)
     progress(done=state.replays, total=None, best=nan, note="each effect against what else it may be")
-    state = _merged(exchange(state, library, rules), rules)
+    state = _merged(exchange(state, library, rules), rules).in_first_steps()
     for _ in range(state.study.procedure.last_turns):
         # they were those of a model that lacked its last effect
         study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)

@@ -65,6 +65,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             if tried.study.numerics != state.study.numerics:
                 return tried
             state = tried
+        state = state.in_longest_steps()
         now = state.fitted
 
         def say(note: str, number: int = number, at: State = state) -> None:

@@ -11,7 +11,9 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted, inflated, judge
+from sysid_btr.identify.step_check import longest_step
 from sysid_btr.identify.study import Study
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.effect import Effect
 
 
@@ -57,6 +59,27 @@ class State:
         """The terms that were added to the declared ones."""
         added = self.fitted.model.terms[len(self.first.model.terms) :]
         return tuple(term for term in added if isinstance(term, Effect))
+
+    def in_longest_steps(self) -> State:
+        """The same in the longest steps that what is left allows; where a stiff effect asked for shorter ones, those.
+
+        While a model is far from a log a step that suits its noise is a waste.
+        """
+        now, finest = self.study.numerics, self.first.study.numerics
+        if now.exact or now.timestep < finest.timestep:
+            return self
+        return self._in_steps(longest_step(self.study, self.fitted.model, finest))
+
+    def in_first_steps(self) -> State:
+        """The same in steps no longer than those in which the declared parameters were fitted."""
+        now, finest = self.study.numerics, self.first.study.numerics
+        return self if now.exact or now.timestep < finest.timestep else self._in_steps(finest)
+
+    def _in_steps(self, numerics: Numerics) -> State:
+        if numerics == self.study.numerics:
+            return self
+        study = replace(self.study, numerics=numerics)
+        return replace(self, study=study, fitted=judge(study, self.fitted.model)).spent(1)
 
     def spent(self, replays: int) -> State:
         """The same after more simulations."""

@@ -1,4 +1,4 @@
-"""Whether the integrator's step is short enough for the estimates."""
+"""Whether the integrator's step is short enough: for the estimates, and for what a model leaves."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import estimates
+from sysid_btr.identify.numerics import CHECK_SECONDS, COARSEST, TOLERATED
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import newton
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.model import Model
 
 if TYPE_CHECKING:
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 SHIFT_TOLERATED = 0.3
 """Shift of an estimate under half the step, in standard errors, beyond which the step is halved."""
 MAX_REFINEMENTS = 3
+ABOUT = 1.01
+"""Step over sample period that is still one step a sample: clocks jitter."""
 FAR = 3.0
 """Mean squared whitened residual beyond which a model is too wrong for its step to matter."""
 
@@ -87,6 +91,33 @@ def with_short_steps(
         spent += polished.evaluations
         at = Optimum.of(problem, polished, study.stencil(model.terms))
     return study, at, shift, spent
+
+
+def longest_step(study: Study, model: Model, finest: Numerics) -> Numerics:
+    """The longest step whose error is as small beside what a model leaves as is asked of it beside the noise.
+
+    While a model is far from a log a step that suits the noise is a waste: what is missing is sought in longer ones.
+
+    Parameters
+    ----------
+    study : with columns that are weighed by what the model leaves in them.
+    finest : numerics with which it was fitted.
+    """
+    if finest.exact or finest.servo_period or not study.procedure.refines_step or study.procedure.costly:
+        return finest
+    period = max(float(np.median(np.diff(e.log.time))) for e in study.train)
+    part = replace(study, train=tuple(e.shortened(CHECK_SECONDS) for e in study.train))
+    problem, chosen = part.train_problem(model), finest
+    now = problem.with_numerics(chosen).residuals(model.values[None])[0]
+    while True:
+        longer = replace(chosen, timestep=2 * chosen.timestep)
+        if longer.timestep > min(COARSEST, ABOUT * period):
+            return chosen
+        there = problem.with_numerics(longer).residuals(model.values[None])[0]
+        change = np.bincount(problem.column_labels, (there - now) ** 2, len(problem.columns)) / problem.counts
+        if not np.sqrt(np.max(change)) <= TOLERATED:
+            return chosen
+        chosen, now = longer, there
 
 
 def _short_enough(at: Optimum, shift: FloatArray) -> bool:

@@ -279,8 +279,8 @@ class LoadFrictionPower(LoadFriction):
     """Friction that grows with a power of the load, as at contacts that flatten under it.
 
     Two thirds for a sphere on a plane (Bowden and Tabor 1950, "The Friction and Lubrication of Solids"); two where a
-    gear is less efficient, the harder it is driven; by none it is dry friction. Its torque is that at a load which is usual for the robot, where
-    motion tells it apart from the exponent.
+    gear is less efficient, the harder it is driven; zero is dry friction. Its torque is that at a load which is usual
+    for the robot, where motion tells it apart from the exponent.
 
     Law: torque (|T| / L)^exponent, with T the servo's torque at the middle of each step and L the median over joints of
     its rms.
