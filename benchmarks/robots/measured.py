@@ -158,14 +158,15 @@ def _open_loop(model: Path, log: Path, work: Path, params: Path) -> float | None
 
 
 def _transfer(data: Path, out: Path, limit: float) -> dict[str, Any]:
-    """Friction fitted on design A, masses on C1; over friction and masses fitted on C1."""
+    """Friction fitted on all logs of design A, masses on C1; over friction and masses fitted on C1."""
     folder = data / "dfki_double_pendulum"
-    log_a, log_c = folder / "logs" / "A12_055640.parquet", folder / "logs" / "C1_143339.parquet"
+    logs_a, log_c = sorted((folder / "logs").glob("A*.parquet")), folder / "logs" / "C1_143339.parquet"
+    of_design = [word for log in logs_a for word in ("--log", str(log))]
     friction = ("--fit", "frictionloss:*", "--fit", "damping:*")
     masses = ("--fit", "mass:*")
     alike = ("--segments", "1")  # which segments a log is cut into depends on the model's friction
     of_a = run(
-        ("fit", "--model", str(folder / "double_pendulum_A.xml"), "--log", str(log_a), *friction, *masses),
+        ("fit", "--model", str(folder / "double_pendulum_A.xml"), *of_design, *friction, *masses),
         out / "of_a",
         limit,
     )
