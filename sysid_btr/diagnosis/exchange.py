@@ -103,7 +103,8 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     if not hypotheses:
         return state
     trials = [Trial(part.hypothesis(model), state.fitted)]
-    trials += [attempt(state.study, rest, hypothesis, rules) for hypothesis in hypotheses]
+    for hypothesis in hypotheses:
+        trials.append(attempt(state.study, rest, hypothesis, rules, [t.fitted for t in trials]))
     state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
     winner = preferred(rules, trials)
     if winner is not trials[0] and state.study.procedure.wanders and not is_likely(rules, state.fitted, winner, trials):

@@ -154,7 +154,8 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
     waiting: list[Hypothesis] = []
 
     def tried(hypothesis: Hypothesis) -> State:
-        trial = attempt(state.study, state.fitted.model, hypothesis, rules)
+        others = (state.fitted, *(t.fitted for t in trials))
+        trial = attempt(state.study, state.fitted.model, hypothesis, rules, others)
         trials.append(trial)
         say(f"with {hypothesis} held-out chi2 {trial.fitted.holdout:.4g}")
         return state.spent(trial.fitted.evaluations)

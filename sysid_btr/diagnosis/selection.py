@@ -89,7 +89,9 @@ class Selection:
     fraction of its gain. Time."""
     outdone: float = 1.0
     """Another law of an effect is not tried if the first one's misfit is so much beyond the best: e times chi2 in one
-    column. Time."""
+    column. Nor is a hypothesis refitted to the end that is so far behind after its first iterations. Time."""
+    first_iterations: int = 1
+    """Of those. Time."""
 
     # --- what is added ---
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -26,10 +27,14 @@ class Trial:
     fitted: Fitted
 
 
-def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
+def attempt(
+    study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection, among: Sequence[Fitted] = ()
+) -> Trial:
     """The model with a hypothesis added, refitted from the best of its initial guesses.
 
-    What was fitted without it may have taken its part, so the others' nominal values are tried too.
+    What was fitted without it may have taken its part, so the others' nominal values are tried too. One that is far
+    behind the best `among` others once it has moved stays there (racing: Maron and Moore 1997,
+    doi:10.1023/A:1006556606079).
     """
     guesses = hypothesis.initial_guesses()
     terms = rest.with_(hypothesis.term(study.scales), guesses[0]).terms
@@ -39,14 +44,26 @@ def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection)
     spent = 0
     while True:
         start = best_start(shorten(study, seconds), terms, starts)
-        found = refit(shorten(study, rules.refit_seconds), Model(terms, start), judged=study)
+        short = shorten(study, rules.refit_seconds)
+        found = refit(short, Model(terms, start), judged=study, iterations=rules.first_iterations)
         spent += found.evaluations + len(starts)
+        if not (found.converged or at_floor(rules, found) or is_behind(rules, found, among)):
+            found = refit(short, found.model, judged=study)
+            spent += found.evaluations
         finer = study.numerics.halved()
         given_up = not study.procedure.refines_step or finer.exact or finer.timestep < rules.finest_step
         if np.isfinite(found.holdout) or given_up:
             return Trial(hypothesis, replace(found, evaluations=spent))
         # a stiff spring on a light body can be too fast for the step
         study = replace(study, numerics=finer)
+
+
+def is_behind(rules: Selection, found: Fitted, among: Sequence[Fitted]) -> bool:
+    """Whether a model leaves far more than the best of others does, held out and everywhere."""
+    return bool(among) and all(
+        measure(found) > min(map(measure, among)) + rules.outdone
+        for measure in (attrgetter("misfit"), attrgetter("misfit_everywhere"))
+    )
 
 
 # --- what is worth a refit ---------------------------------------------------------------------------------

@@ -51,6 +51,7 @@ class Fitted:
     train_counts, holdout_counts : (columns, stretches) number of samples.
     evaluations : candidates simulated.
     numerics : with which it was judged.
+    converged : whether its parameters are where least squares lead, as far as that was asked for.
     """
 
     model: Model
@@ -67,6 +68,7 @@ class Fitted:
     holdout_counts: FloatArray
     evaluations: int
     numerics: Numerics
+    converged: bool = False
 
     @property
     def chance(self) -> FloatArray:
@@ -122,7 +124,7 @@ def refit(
     for _ in range(RELIEFS):
         result = _minimised(study, model, polish, iterations, budget.after(spent), progress)
         model, spent = model.at(result.x), spent + result.evaluations
-        found = judge(judged or study, model, evaluations=spent)
+        found = replace(judge(judged or study, model, evaluations=spent), converged=result.converged)
         if not Stated.of(model.terms.parameters, study.redundancy).weight.any():
             break
         own = inflate(study, found, memory=study.independent)
