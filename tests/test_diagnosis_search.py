@@ -112,7 +112,7 @@ def test_nothing_takes_a_place_that_is_unlikely_to_be_what_it_is_called(
     now = replace(state.fitted, model=state.fitted.model.with_(own.term(state.study.scales), own.start))
     state = replace(state, fitted=now, evidence=(Evidence(alternatives=(other,)),))
 
-    def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection) -> Trial:
+    def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection, among: object) -> Trial:
         model = rest.with_(hypothesis.term(study.scales), hypothesis.start)
         return Trial(hypothesis, replace(now, model=model, holdout_columns=0.8 * now.holdout_columns))
 
@@ -151,11 +151,14 @@ def test_a_special_case_goes_first_while_more_is_left_than_its_law_would_take(
     power = Hypothesis(LoadFrictionPower, ("knee",), False, np.array([0.1, 0.8]), 1.0)
     trial = attempt(state.study, state.fitted.model, power, STANDARD)
     library = (CoulombFriction, ViscousDamping, LoadFriction, LoadFrictionPower)
-    simple, spent = of_a_special_case(state.study, state.fitted, trial, library, STANDARD)
+    simple, spent = of_a_special_case(state.study, state.fitted, trial, [trial], library, STANDARD)
     assert simple.hypothesis.effect is first
     assert (spent > 0) == (spring > 0)
     if first is not LoadFrictionPower:
         assert simple.fitted.holdout - trial.fitted.holdout < trial.fitted.holdout - 1
+        # what was tried in the round is not tried again
+        again, spent = of_a_special_case(state.study, state.fitted, trial, [trial, simple], (first,), STANDARD)
+        assert (again, spent) == (simple, 0)
 
 
 def test_a_special_case_is_not_added_where_it_is_already() -> None:
@@ -164,7 +167,24 @@ def test_a_special_case_is_not_added_where_it_is_already() -> None:
     before = judge(state.study, rubs)
     power = Hypothesis(LoadFrictionPower, ("knee",), False, np.array([0.1, 1.0]), 1.0)
     trial = attempt(state.study, rubs, power, STANDARD)
-    assert of_a_special_case(state.study, before, trial, (CoulombFriction,), STANDARD) == (trial, 0)
+    assert of_a_special_case(state.study, before, trial, [trial], (CoulombFriction,), STANDARD) == (trial, 0)
+
+
+# --- racing ------------------------------------------------------------------------------------------------
+
+
+def test_a_hypothesis_far_behind_is_left_where_its_first_iterations_end() -> None:
+    state = rubbing(0.5, 0.0)
+    power = Hypothesis(LoadFrictionPower, ("knee",), False, np.array([0.1, 0.8]), 1.0)
+    elsewhere = Hypothesis(LoadFrictionPower, ("ankle",), False, np.array([0.1, 0.8]), 1.0)
+    right = attempt(state.study, state.fitted.model, power, STANDARD, (state.fitted,))
+    assert right.fitted.holdout < 1.1
+    wrong = [attempt(state.study, state.fitted.model, elsewhere, STANDARD, a) for a in ((), (right.fitted,))]
+    assert wrong[1].fitted.evaluations < wrong[0].fitted.evaluations
+    assert all(w.fitted.misfit > right.fitted.misfit + STANDARD.outdone for w in wrong)
+    # what leads is found as it is without others
+    alone = attempt(state.study, state.fitted.model, power, STANDARD)
+    assert alone.fitted.model.values == pytest.approx(right.fitted.model.values)
 
 
 # --- steps as long as what is left allows -------------------------------------------------------------------

@@ -131,8 +131,8 @@ def _simplified(
     state: State, winner: Trial, trials: list[Trial], library: Library, rules: Selection
 ) -> tuple[State, Trial, list[Trial]]:
     """The winner of a round as the special case of its law that will do for now, one of all trials."""
-    simple, spent = of_a_special_case(state.study, state.fitted, winner, library, rules)
-    return state.spent(spent), simple, trials if simple is winner else [*trials, simple]
+    simple, spent = of_a_special_case(state.study, state.fitted, winner, trials, library, rules)
+    return state.spent(spent), simple, trials if simple in trials else [*trials, simple]
 
 
 def _is_likely(state: State, winner: Trial | None, trials: Sequence[Trial], rules: Selection) -> bool:

@@ -27,9 +27,7 @@ class Trial:
     fitted: Fitted
 
 
-def attempt(
-    study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection, among: Sequence[Fitted] = ()
-) -> Trial:
+def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection, among: Sequence[Fitted] = ()) -> Trial:
     """The model with a hypothesis added, refitted from the best of its initial guesses.
 
     What was fitted without it may have taken its part, so the others' nominal values are tried too. One that is far
@@ -197,7 +195,12 @@ def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner
 
 
 def of_a_special_case(
-    study: Study, before: Fitted, trial: Trial, library: Sequence[type[Effect]], rules: Selection
+    study: Study,
+    before: Fitted,
+    trial: Trial,
+    others: Sequence[Trial],
+    library: Sequence[type[Effect]],
+    rules: Selection,
 ) -> tuple[Trial, int]:
     """A trial with a simpler law that its own includes, if that will do for now; and what that took.
 
@@ -205,7 +208,6 @@ def of_a_special_case(
     than the two differ by, the simple one goes first. Where it is not enough the other follows it.
     """
     effect, places = trial.hypothesis.effect, trial.hypothesis.places
-    left, gain = trial.fitted.holdout - 1, before.holdout - trial.fitted.holdout
     if effect in FREE_FORMS or at_floor(rules, trial.fitted):
         return trial, 0
     spent, simpler = 0, list[Trial]()
@@ -215,11 +217,15 @@ def of_a_special_case(
         there = tuple(p for p in places if p in study.robot.names(kind.scope) and before.model.terms.admit(kind, [p]))
         if not there:
             continue
-        start = np.concatenate([kind.probes(scale_at(study.scales, p))[0][0] for p in there])
-        found = attempt(study, before.model, Hypothesis(kind, there, False, start, trial.hypothesis.gain), rules)
-        spent += found.fitted.evaluations
-        lost = found.fitted.holdout - trial.fitted.holdout
-        if lost < min(left, (1 - rules.law) * gain):
+        found = next(
+            (t for t in others if t.hypothesis.effect is kind and set(t.hypothesis.places) == set(there)), None
+        )
+        if found is None or found.hypothesis.shared:
+            start = np.concatenate([kind.probes(scale_at(study.scales, p))[0][0] for p in there])
+            found = attempt(study, before.model, Hypothesis(kind, there, False, start, trial.hypothesis.gain), rules)
+            spent += found.fitted.evaluations
+        lost, gain = found.fitted.holdout - trial.fitted.holdout, before.holdout - trial.fitted.holdout
+        if lost < min(trial.fitted.holdout - 1, (1 - rules.law) * gain):
             simpler.append(found)
     return min(simpler, key=lambda t: t.fitted.misfit, default=trial), spent
 
