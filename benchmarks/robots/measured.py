@@ -166,9 +166,7 @@ def _transfer(data: Path, out: Path, limit: float) -> dict[str, Any]:
     masses = ("--fit", "mass:*")
     alike = ("--segments", "1")  # which segments a log is cut into depends on the model's friction
     of_a = run(
-        ("fit", "--model", str(folder / "double_pendulum_A.xml"), *of_design, *friction, *masses),
-        out / "of_a",
-        limit,
+        ("fit", "--model", str(folder / "double_pendulum_A.xml"), *of_design, *friction, *masses), out / "of_a", limit
     )
     found = {p["name"]: p["value"] for p in of_a.result.get("parameters", ())}
     model_c = str(folder / "double_pendulum_C1.xml")

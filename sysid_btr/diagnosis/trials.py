@@ -217,10 +217,9 @@ def of_a_special_case(
         there = tuple(p for p in places if p in study.robot.names(kind.scope) and before.model.terms.admit(kind, [p]))
         if not there:
             continue
-        found = next(
-            (t for t in others if t.hypothesis.effect is kind and set(t.hypothesis.places) == set(there)), None
-        )
-        if found is None or found.hypothesis.shared:
+        own = (t for t in others if t.hypothesis.effect is kind and not t.hypothesis.shared)
+        found = next((t for t in own if set(t.hypothesis.places) == set(there)), None)
+        if found is None:
             start = np.concatenate([kind.probes(scale_at(study.scales, p))[0][0] for p in there])
             found = attempt(study, before.model, Hypothesis(kind, there, False, start, trial.hypothesis.gain), rules)
             spent += found.fitted.evaluations

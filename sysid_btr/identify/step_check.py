@@ -13,7 +13,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import estimates
-from sysid_btr.identify.numerics import CHECK_SECONDS, COARSEST, TOLERATED
+from sysid_btr.identify.numerics import COARSEST, TOLERATED
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import newton
 from sysid_btr.objectives.problem import ReplayProblem
@@ -106,15 +106,15 @@ def longest_step(study: Study, model: Model, finest: Numerics) -> Numerics:
     if finest.exact or finest.servo_period or not study.procedure.refines_step or study.procedure.costly:
         return finest
     period = max(float(np.median(np.diff(e.log.time))) for e in study.train)
-    part = replace(study, train=tuple(e.shortened(CHECK_SECONDS) for e in study.train))
-    problem, chosen = part.train_problem(model), finest
+    problem, chosen = study.train_problem(model), finest
     now = problem.with_numerics(chosen).residuals(model.values[None])[0]
     while True:
         longer = replace(chosen, timestep=2 * chosen.timestep)
         if longer.timestep > min(COARSEST, ABOUT * period):
             return chosen
         there = problem.with_numerics(longer).residuals(model.values[None])[0]
-        change = np.bincount(problem.column_labels, (there - now) ** 2, len(problem.columns)) / problem.counts
+        change = np.bincount(problem.column_labels, (there - now) ** 2, len(problem.columns))
+        change /= np.maximum(problem.counts, 1)
         if not np.sqrt(np.max(change)) <= TOLERATED:
             return chosen
         chosen, now = longer, there
