@@ -113,9 +113,8 @@ def longest_step(study: Study, model: Model, finest: Numerics) -> Numerics:
         if longer.timestep > min(COARSEST, ABOUT * period):
             return chosen
         there = problem.with_numerics(longer).residuals(model.values[None])[0]
-        change = np.bincount(problem.column_labels, (there - now) ** 2, len(problem.columns))
-        change /= np.maximum(problem.counts, 1)
-        if not np.sqrt(np.max(change)) <= TOLERATED:
+        square = np.bincount(problem.column_labels, (there - now) ** 2, len(problem.columns))
+        if not np.sqrt(np.max(square / np.maximum(problem.counts, 1))) <= TOLERATED:
             return chosen
         chosen, now = longer, there
 
