@@ -69,7 +69,7 @@ VERBS: tuple[Callable[[Any], int], ...] = (
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and end the process with its exit code."""
-    # threads of linear algebra spin beside those that simulate: of `close` on a TX40 a third of the time
+    # threads of linear algebra spin beside those that simulate: a third of the CPU time of `close` on a TX40
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     open_streams()
     try:

@@ -91,7 +91,7 @@ class Selection:
     """Another law of an effect is not tried if the first one's misfit is so much beyond the best: e times chi2 in one
     column. Nor is a hypothesis refitted to the end that is so far behind after its first iterations. Time."""
     first_iterations: int = 1
-    """Of those. Time."""
+    """Iterations of a refit after which it is compared with the best so far. Time."""
 
     # --- what is added ---
 

@@ -61,21 +61,25 @@ class State:
         return tuple(term for term in added if isinstance(term, Effect))
 
     def in_longest_steps(self) -> State:
-        """The same in the longest steps that what is left allows; where a stiff effect asked for shorter ones, those.
+        """The same in the longest steps that what is left allows; where an effect asked for shorter ones, in those.
 
         While a model is far from a log a step that suits its noise is a waste.
         """
-        now, finest = self.study.numerics, self.first.study.numerics
-        if now.exact or now.timestep < finest.timestep:
+        if self._steps_are_given:
             return self
-        return self._in_steps(longest_step(self.study, self.fitted.model, finest))
+        return self._judged_in(longest_step(self.study, self.fitted.model, self.first.study.numerics))
 
     def in_first_steps(self) -> State:
         """The same in steps no longer than those in which the declared parameters were fitted."""
-        now, finest = self.study.numerics, self.first.study.numerics
-        return self if now.exact or now.timestep < finest.timestep else self._in_steps(finest)
+        return self if self._steps_are_given else self._judged_in(self.first.study.numerics)
 
-    def _in_steps(self, numerics: Numerics) -> State:
+    @property
+    def _steps_are_given(self) -> bool:
+        """Whether they are part of the model, or shorter than the first for what was added."""
+        now = self.study.numerics
+        return now.exact or now.timestep < self.first.study.numerics.timestep
+
+    def _judged_in(self, numerics: Numerics) -> State:
         if numerics == self.study.numerics:
             return self
         study = replace(self.study, numerics=numerics)

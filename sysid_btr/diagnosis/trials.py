@@ -45,7 +45,7 @@ def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection,
         short = shorten(study, rules.refit_seconds)
         found = refit(short, Model(terms, start), judged=study, iterations=rules.first_iterations)
         spent += found.evaluations + len(starts)
-        if not (found.converged or at_floor(rules, found) or is_behind(rules, found, among)):
+        if not (found.converged or at_floor(rules, found) or _is_behind(rules, found, among)):
             found = refit(short, found.model, judged=study)
             spent += found.evaluations
         finer = study.numerics.halved()
@@ -56,7 +56,7 @@ def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection,
         study = replace(study, numerics=finer)
 
 
-def is_behind(rules: Selection, found: Fitted, among: Sequence[Fitted]) -> bool:
+def _is_behind(rules: Selection, found: Fitted, among: Sequence[Fitted]) -> bool:
     """Whether a model leaves far more than the best of others does, held out and everywhere."""
     return bool(among) and all(
         measure(found) > min(map(measure, among)) + rules.outdone

@@ -13,7 +13,7 @@ from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import estimates
-from sysid_btr.identify.numerics import COARSEST, TOLERATED
+from sysid_btr.identify.numerics import TOLERATED, largest_step
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import newton
 from sysid_btr.objectives.problem import ReplayProblem
@@ -27,7 +27,7 @@ SHIFT_TOLERATED = 0.3
 """Shift of an estimate under half the step, in standard errors, beyond which the step is halved."""
 MAX_REFINEMENTS = 3
 ABOUT = 1.01
-"""Step over sample period that is still one step a sample: clocks jitter."""
+"""Step over the largest one of a log that is still that: clocks jitter."""
 FAR = 3.0
 """Mean squared whitened residual beyond which a model is too wrong for its step to matter."""
 
@@ -105,16 +105,16 @@ def longest_step(study: Study, model: Model, finest: Numerics) -> Numerics:
     """
     if finest.exact or finest.servo_period or not study.procedure.refines_step or study.procedure.costly:
         return finest
-    period = max(float(np.median(np.diff(e.log.time))) for e in study.train)
+    most = ABOUT * max(largest_step(e.log).timestep for e in study.train)
     problem, chosen = study.train_problem(model), finest
     now = problem.with_numerics(chosen).residuals(model.values[None])[0]
     while True:
         longer = replace(chosen, timestep=2 * chosen.timestep)
-        if longer.timestep > min(COARSEST, ABOUT * period):
+        if longer.timestep > most:
             return chosen
         there = problem.with_numerics(longer).residuals(model.values[None])[0]
-        square = np.bincount(problem.column_labels, (there - now) ** 2, len(problem.columns))
-        if not np.sqrt(np.max(square / np.maximum(problem.counts, 1))) <= TOLERATED:
+        change = problem.column_chi2(there - now) / problem.inflation
+        if not np.sqrt(np.max(change)) <= TOLERATED:
             return chosen
         chosen, now = longer, there
 
