@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from walks import Scale, Truth, plain_walk, record_walk
 
 from sysid_btr.errors import LogError, ModelError
+from sysid_btr.floating_base.attitude import resting, turning_over
 from sysid_btr.floating_base.estimate import BaseState, estimate_base, find_contacts
 from sysid_btr.floating_base.events import FALLEN, Event, find_fall, find_pickups, find_slips, usable
 from sysid_btr.floating_base.feet import force_columns, points_in_base, touching_bodies
@@ -26,6 +29,7 @@ from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.numerics import Numerics
 
 INNER = slice(10, -10)
+Vector = tuple[float, float, float]
 
 
 def estimate(log: Log, truth: Truth) -> BaseState:
@@ -119,6 +123,43 @@ def test_without_gyro_it_refuses_and_names_what_is_missing() -> None:
     log, truth = plain_walk()
     with pytest.raises(LogError, match=r"imu\.gyro_x, imu\.gyro_y, imu\.gyro_z"):
         estimate(without(log, "imu.gyro"), truth)
+
+
+def test_without_an_inertial_unit_the_feet_say_how_the_robot_stands() -> None:
+    log, truth = plain_walk()
+    state = estimate(without(without(log, "imu."), "force."), truth)
+    assert any("no inertial unit" in text for text in state.lost)
+    found = errors(state, truth)
+    # steps of a walk tilt the soles; a robot that stands does not
+    assert rms(found["tilt"][0]) < 0.025
+    assert rms(found["height"][0]) < 1e-3
+    assert rms(found["velocity"][0]) < 0.1
+    for name in ("tilt", "height", "velocity", "rate"):
+        error, std = found[name]
+        assert np.mean(np.abs(error) < 1.96 * std) > 0.8, name
+        assert rms(std) < 4 * rms(error), name
+
+
+@given(rate=st.tuples(*[st.floats(-3, 3)] * 3), drift=st.tuples(*[st.floats(-1, 1)] * 3), seed=st.integers(0, 99))
+def test_the_base_turns_as_points_at_rest_seem_to_turn_about_it(rate: Vector, drift: Vector, seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(-0.1, 0.1, (5, 3))
+    found = turning_over(points, -np.asarray(drift) - np.cross(rate, points))
+    assert found == pytest.approx(np.asarray(rate), abs=1e-6)
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.2, -0.1])
+def test_a_robot_at_rest_stands_on_its_soles(lean: float) -> None:
+    _log, truth = plain_walk()
+    addresses = np.array([truth.model.jnt_qposadr[truth.model.joint(j).id] for j in truth.joints])
+    stance = np.zeros(len(truth.joints))
+    for side in "LR":
+        stance[truth.joints.index(f"{side}HipPitch")] = lean
+    feet = touching_bodies(truth.model)
+    points = np.concatenate([p[0] for p in points_in_base(truth.model, feet, addresses, stance[None])])
+    radius = np.concatenate([f.radius for f in feet])
+    up = resting(truth.model, addresses, stance, points, radius)
+    # the hips turn about y: what is up for the soles is turned by as much in the trunk
+    assert up == pytest.approx(np.array([np.sin(lean), 0.0, np.cos(lean)]), abs=2e-3)
 
 
 def test_a_held_model_is_refused_for_a_free_log() -> None:

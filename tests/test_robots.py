@@ -15,6 +15,7 @@ from benchmarks.robots.planted import DryFriction, Late, Planted
 from benchmarks.robots.regression import regress
 from benchmarks.robots.suite import Case, cases
 from sysid_btr.diagnosis.close import close
+from sysid_btr.floating_base.episode import FloatingEpisode
 from sysid_btr.identify.inverse import InverseEpisode
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
@@ -44,6 +45,21 @@ def test_another_drive_comes_to_the_right_answer(name: str, tmp_path: Path) -> N
     study = make_study(nominal(case, tmp_path), [log], threads=1)
     rivals = ("coulomb_friction", "viscous_damping", "armature", "command_delay", "torque_offset", "encoder_offset")
     found = close(study, ["mass:*"], effects=rivals)
+    answer = judge(found.to_dict(), case.planted, case.alike)
+    assert answer.answer == "right", (answer, found.message)
+
+
+def test_a_robot_that_stands_needs_no_inertial_unit(tmp_path: Path) -> None:
+    """It stands on its soles and waves its arms."""
+    case, log = short("standing")
+    study = make_study(nominal(case, tmp_path), [log], threads=1)
+    (episode,) = study.train
+    assert isinstance(episode, FloatingEpisode)
+    assert any("no inertial unit" in text for text in episode.base.lost)
+    # its trunk leans by what hips, knees and ankles give, not more
+    assert episode.base.tilt.max() < 0.15
+    arms = ["mass:*_hand", "kp:*=shared"]
+    found = close(study, arms, effects=("coulomb_friction", "viscous_damping", "armature"))
     answer = judge(found.to_dict(), case.planted, case.alike)
     assert answer.answer == "right", (answer, found.message)
 

@@ -118,6 +118,35 @@ CART_POLE = f"""<mujoco>{HEAD}{FREE}
 <actuator><motor name="rail" joint="rail"/></actuator></mujoco>"""
 
 
+def humanoid() -> str:
+    """Two legs with soles and two arms on a trunk that is free, without any IMU."""
+    limbs = ""
+    for side, y in (("left", 0.07), ("right", -0.07)):
+        limbs += (
+            f'<body name="{side}_thigh" pos="0 {y} 0"><joint name="{side}_hip" axis="0 1 0"/>'
+            '<geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.03" mass="0.5" contype="0" conaffinity="0"/>'
+            f'<body name="{side}_shank" pos="0 0 -0.15"><joint name="{side}_knee" axis="0 1 0"/>'
+            '<geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.025" mass="0.4" contype="0" conaffinity="0"/>'
+            f'<body name="{side}_foot" pos="0 0 -0.15"><joint name="{side}_ankle" axis="0 1 0"/>'
+            '<geom type="box" pos="0.02 0 -0.03" size="0.08 0.04 0.01" mass="0.2" friction="0.9"/></body></body></body>'
+            f'<body name="{side}_arm" pos="0 {2.2 * y} 0.3"><joint name="{side}_shoulder" axis="0 1 0"/>'
+            '<geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.02" mass="0.3" contype="0" conaffinity="0"/>'
+            f'<body name="{side}_hand" pos="0 0 -0.15"><joint name="{side}_elbow" axis="0 1 0"/>'
+            '<geom type="capsule" fromto="0 0 0 0 0 -0.14" size="0.02" mass="0.25" contype="0" conaffinity="0"/></body>'
+            "</body>"
+        )
+    joints = [f"{side}_{part}" for side in ("left", "right") for part in HUMANOID]
+    servos = "".join(f'<position name="{j}" joint="{j}" kp="40" kv="0.8"/>' for j in joints)
+    return f"""<mujoco>{HEAD}<default><joint armature="0.008" damping="0.05"/></default>
+<worldbody><geom name="floor" type="plane" size="20 20 1" friction="0.9"/>
+<body name="trunk" pos="0 0 0.335"><freejoint name="base"/>
+<geom type="box" pos="0 0 0.15" size="0.06 0.1 0.15" mass="1.6" contype="0" conaffinity="0"/>{limbs}</body></worldbody>
+<actuator>{servos}</actuator></mujoco>"""
+
+
+HUMANOID = ("hip", "knee", "ankle", "shoulder", "elbow")
+
+
 def quadruped() -> str:
     """Four legs of two joints under a trunk that is free, with an IMU."""
     legs = ""

@@ -144,7 +144,7 @@ class Experiment:
     interpolated : drives go from one command to the next, and do not hold it (of commands that no sensor changes). A
         torque that is read as a held command jumps is not the one that moved the robot.
     start : positions at rest, by joint; those of the keyframe, or zero, of others.
-    imu : the base is free and has one.
+    free, imu : the base is free; and has an inertial unit.
     frequencies : Hz, between which the motion has its sines.
     stride : (j,) phases of a motion of one frequency; None: several sines.
     meta : what the log says of itself.
@@ -162,6 +162,7 @@ class Experiment:
     silent: bool = False
     interpolated: bool = False
     start: Mapping[str, float] = field(default_factory=dict)
+    free: bool = False
     imu: bool = False
     frequencies: tuple[float, float] = (0.15, 1.2)
     stride: tuple[float, ...] | None = None
@@ -220,7 +221,7 @@ def record(xml: str, experiment: Experiment, planted: Sequence[Planted], heavier
     for one in planted:
         one.read(channels)
     meta = LogMeta(
-        mount="free" if experiment.imu else "fixed",
+        mount="free" if experiment.free else "fixed",
         sample_period=1 / experiment.rate,
         source="simulated",
         **experiment.meta,

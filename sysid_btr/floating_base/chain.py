@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.floating_base.estimate import NEAR, BaseState, foot_loads, imu_columns, lowest_points, vertical
+from sysid_btr.floating_base.attitude import NEAR
+from sysid_btr.floating_base.estimate import BaseState, foot_loads, lowest_points
 from sysid_btr.floating_base.feet import touching_bodies
 from sysid_btr.floating_base.segments import FloatingReplay, starts_at, whole_step
 from sysid_btr.floating_base.size import BodySize
@@ -293,10 +294,11 @@ def suits(replay: FloatingReplay) -> bool:
 
 
 def chainable(log: Log, terms: Sequence[Term]) -> bool:
-    """Whether samples are regular, and enough, and no term needs more than a state."""
+    """Whether the base's turning is measured, samples are regular and enough, and no term needs more than a state."""
     time = log.time
     return (
-        len(time) >= LEAST
+        bool(log.joints("imu"))
+        and len(time) >= LEAST
         and float(np.ptp(np.diff(time))) < 1e-4 * float(time[1] - time[0])
         and not any(remembers(type(term)) for term in terms)
     )
@@ -333,14 +335,13 @@ def chain_of(replay: FloatingReplay) -> Chain:
     share = touch / np.maximum(touch.sum(axis=1, keepdims=True), 1)
     wrench = np.zeros((n - 1, touch.shape[1], 6))
     wrench[:, :, 2] = base.size.weight * share
-    gyro = imu_columns(walk, ("gyro_x", "gyro_y", "gyro_z"))
-    up, up_std = vertical(walk, base.size, [])
+    attitude = base.attitude
     joints = [walk.channels[f"position.{j}"] if walk.has("position", j) else np.full(n, np.nan) for j in base.joints]
-    measured = np.column_stack([*joints, gyro, up[:, :2]])
-    noise = np.array([noise_floor(c).sigma if np.isfinite(c).any() else np.inf for c in (*joints, *gyro.T)])
+    measured = np.column_stack([*joints, attitude.turning, attitude.up[:, :2]])
+    noise = np.array([noise_floor(c).sigma if np.isfinite(c).any() else np.inf for c in joints])
     # a joint that stands still shows no noise, and is known no better than the others
-    noise[: len(joints)] = np.maximum(noise[: len(joints)], 0.5 * np.median(noise[: len(joints)]))
-    sigma = np.column_stack([np.tile(noise, (n, 1)), up_std, up_std])
+    noise = np.maximum(noise, 0.5 * np.median(noise))
+    sigma = np.column_stack([np.tile(noise, (n, 1)), attitude.turning_std, attitude.up_std, attitude.up_std])
     sigma[~np.isfinite(measured) | ~base.usable[:, None]] = np.inf
     return Chain(
         steps=replace(steps, wrench=wrench),

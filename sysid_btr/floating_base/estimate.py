@@ -15,10 +15,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.errors import LogError, ModelError
+from sysid_btr.errors import ModelError
+from sysid_btr.floating_base.attitude import HEIGHT_STD, NEAR, Attitude, imu_columns, of_feet, of_inertial_unit
 from sysid_btr.floating_base.events import Event, find_fall, find_pickups, find_slips, usable
-from sysid_btr.floating_base.feet import Foot, base_body, force_columns, points_in_base, touching_bodies
-from sysid_btr.floating_base.orientation import smooth_orientation, up_in_base
+from sysid_btr.floating_base.feet import (
+    FeetMotion,
+    Foot,
+    base_body,
+    feet_motion,
+    force_columns,
+    points_in_base,
+    touching_bodies,
+)
+from sysid_btr.floating_base.orientation import smooth_orientation
 from sysid_btr.floating_base.size import BodySize, measure_size
 from sysid_btr.identify.smoothing import Tracks, smooth, smooth_joints
 from sysid_btr.io.noise import noise_floor
@@ -33,16 +42,10 @@ LOADED = 0.08
 """Fraction of the weight on a foot above which it stands."""
 LOWEST = 0.015
 """m above the lowest foot up to which a loaded foot can stand."""
-NEAR = 0.006
-"""m above the lowest foot up to which a foot stands where no force sensor says otherwise."""
 EDGE = 0.002
 """m over which the points of a foot share its contact."""
-HEIGHT_STD = 0.0007
-"""m, of a standing foot's lowest point: the ground gives, soles are not flat."""
 SLIDE_STD = 0.005
 """m/s, of the point of a standing foot that touches, beyond what encoders and gyro explain."""
-TILT_STD = 0.02
-"""rad, of the vertical taken from the accelerometer, at rest."""
 OUTLIER = 2.5
 """Standard errors beyond which a foot's velocity is given less weight (Huber)."""
 ROUNDS = 3
@@ -65,6 +68,7 @@ class BaseState:
     rotation : (n, 3, 3) base to world; yaw starts at zero.
     position, velocity : (n, 3) of the base's origin in the world, m and m/s; x and y start at zero.
     rate : (n, 3) angular velocity in the base's frame, rad/s.
+    attitude : what the log says of it and of the vertical.
     joints : (j,) names.
     joint_position, joint_velocity : (n, j).
     rotation_std : (n, 3) about the world's axes, rad; the other `_std` are in the unit of what they belong to.
@@ -81,6 +85,7 @@ class BaseState:
     position: FloatArray
     velocity: FloatArray
     rate: FloatArray
+    attitude: Attitude
     joints: tuple[str, ...]
     joint_position: FloatArray
     joint_velocity: FloatArray
@@ -122,7 +127,7 @@ class BaseState:
             for name, value in vars(self).items()
             if isinstance(value, np.ndarray) and len(value) == n
         }
-        return replace(self, **cut)
+        return replace(self, attitude=self.attitude.rows(start, stop), **cut)
 
 
 def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addresses: IntArray) -> BaseState:
@@ -131,8 +136,8 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
     Parameters
     ----------
     model : with a free base.
-    log : joint positions, ``imu.gyro_x..z``, and ``imu.angle_x``, ``imu.angle_y`` or ``imu.acc_x..z``;
-        ``force.*`` under the feet if there are any.
+    log : joint positions; ``imu.gyro_x..z``, and ``imu.angle_x``, ``imu.angle_y`` or ``imu.acc_x..z``, unless the robot
+        only stands; ``force.*`` under the feet if there are any.
     joints, addresses : joints of the model and their addresses in qpos, (j,).
 
     Raises
@@ -146,12 +151,13 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
     time = log.time - log.time[0]
     feet, size = _feet(model), measure_size(model)
     tracks = smooth_joints(time, _measured(model, log, joints, addresses), size.time(1.0))
-    gyro = imu_columns(log, ("gyro_x", "gyro_y", "gyro_z"))
-    rates = smooth_joints(time, gyro, size.time(1.0), derivative=1)
-    up, up_std = vertical(log, size, lost)
-    gyro_std = float(np.mean([noise_floor(c).sigma for c in gyro.T]))
-    rotation, rotation_std = smooth_orientation(time, gyro, up, gyro_std, up_std)
-    soles = _soles(model, feet, addresses, tracks, rates, rotation, size)
+    motion = feet_motion(model, feet, addresses, tracks, size.time(1e-4))
+    attitude = _attitude(model, log, motion, addresses, tracks, size, lost)
+    rates = attitude.rates
+    rotation, rotation_std = smooth_orientation(
+        time, attitude.turning, attitude.up, float(np.mean(attitude.turning_std)), attitude.up_std
+    )
+    soles = _soles(motion, tracks, rates, rotation, size)
     load = foot_loads(model, feet, log, lost)
     contact = find_contacts(soles.bottom, load, size)
     force = _specific_force(model, log, rates, lost)
@@ -164,10 +170,11 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
         position=position[0],
         velocity=velocity[0],
         rate=rates.position,
+        attitude=attitude,
         joints=tuple(joints),
         joint_position=tracks.position,
         joint_velocity=tracks.velocity,
-        rotation_std=rotation_std,
+        rotation_std=np.hypot(rotation_std, attitude.steady),
         position_std=np.hypot(position[1], [0.0, 0.0, size.length(SUNK)]),
         velocity_std=UNSTEADY * velocity[1],
         rate_std=UNSTEADY * rates.position_std,
@@ -180,6 +187,25 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
         lost=tuple(lost),
         size=size,
     )
+
+
+def _attitude(
+    model: mujoco.MjModel,
+    log: Log,
+    feet: FeetMotion,
+    addresses: IntArray,
+    joints: Tracks,
+    size: BodySize,
+    lost: list[str],
+) -> Attitude:
+    """What the log says of the base's attitude: by its inertial unit, or by the feet where there is none."""
+    if log.joints("imu"):
+        return of_inertial_unit(log, size, lost)
+    lost.append(
+        "no inertial unit: the robot is taken to stand on level ground, on what of it is lowest; falls and slips are "
+        "not found"
+    )
+    return of_feet(model, log.time, feet, addresses, joints, size)
 
 
 def _measured(model: mujoco.MjModel, log: Log, joints: Sequence[str], addresses: IntArray) -> FloatArray:
@@ -207,26 +233,15 @@ class _Soles:
     std: FloatArray
 
 
-def _soles(
-    model: mujoco.MjModel,
-    feet: Sequence[Foot],
-    addresses: IntArray,
-    tracks: Tracks,
-    rates: Tracks,
-    rotation: FloatArray,
-    size: BodySize,
-) -> _Soles:
-    moment = size.time(1e-4)
-    here = points_in_base(model, feet, addresses, tracks.position)
-    ahead = points_in_base(model, feet, addresses, tracks.position + moment * tracks.velocity)
+def _soles(feet: FeetMotion, tracks: Tracks, rates: Tracks, rotation: FloatArray, size: BodySize) -> _Soles:
     noise = np.mean(tracks.velocity_std, axis=1) * 2 + np.mean(rates.position_std, axis=1)
     bottom, moving, std = [], [], []
-    for foot, points, later in zip(feet, here, ahead, strict=True):
+    for foot, points, own in zip(feet.feet, feet.points, feet.moving, strict=True):
         world = np.einsum("nij,nkj->nki", rotation, points)
         height = world[..., 2] - foot.radius
         share = np.exp(-(height - height.min(axis=1, keepdims=True)) / size.length(EDGE))
         share /= share.sum(axis=1, keepdims=True)
-        relative = (later - points) / moment + np.cross(rates.position[:, None], points)
+        relative = own + np.cross(rates.position[:, None], points)
         motion = np.einsum("nij,nkj->nki", rotation, relative)
         bottom.append(np.sum(share * height, axis=1))
         moving.append(np.einsum("nk,nki->ni", share, motion))
@@ -298,42 +313,6 @@ def _feet(model: mujoco.MjModel) -> tuple[Foot, ...]:
     return feet
 
 
-def imu_columns(log: Log, names: tuple[str, ...]) -> FloatArray:
-    """Columns of the inertial unit, (n, k), with single missing values interpolated.
-
-    Raises
-    ------
-    LogError
-        If one of them is missing or empty.
-    """
-    missing = [f"imu.{n}" for n in names if not log.has("imu", n)]
-    if missing:
-        raise LogError(
-            f"log {log.path or ''}: a floating-base log without {', '.join(missing)}: the orientation of the "
-            "base needs imu.gyro_x..z, and imu.angle_x, imu.angle_y or imu.acc_x..z"
-        )
-    values = log.array("imu", names)
-    index = np.arange(len(values))
-    for column in values.T:
-        good = np.isfinite(column)
-        if not good.any():
-            raise LogError(f"log {log.path or ''}: a column of the IMU has no values")
-        column[~good] = np.interp(index[~good], index[good], column[good])
-    return values
-
-
-def vertical(log: Log, size: BodySize, lost: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Measured vertical in the base's frame, and its standard deviation."""
-    if log.has("imu", "angle_x") and log.has("imu", "angle_y"):
-        angles = imu_columns(log, ("angle_x", "angle_y"))
-        sigma = float(np.mean([noise_floor(c).sigma for c in np.unwrap(angles, axis=0).T]))
-        return up_in_base(angles[:, 0], angles[:, 1]), np.full(len(angles), max(sigma, 1e-4))
-    force = imu_columns(log, ("acc_x", "acc_y", "acc_z"))
-    felt = np.linalg.norm(force, axis=1)
-    lost.append("no inclinometer: the vertical is the accelerometer's, more uncertain while the robot accelerates")
-    return force / felt[:, None], TILT_STD + np.abs(felt - size.gravity) / size.gravity + 0.05
-
-
 def foot_loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list[str]) -> FloatArray | None:
     """Force on each foot, (n, f); None, and what that means in `lost`, where nothing measures it."""
     columns = force_columns(model, feet, log.joints("force"))
@@ -351,6 +330,8 @@ def foot_loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list
 def _specific_force(model: mujoco.MjModel, log: Log, rates: Tracks, lost: list[str]) -> tuple[FloatArray, float] | None:
     """Specific force at the base's origin in its frame, (n, 3), and its noise; None without accelerometer."""
     names = ("acc_x", "acc_y", "acc_z")
+    if not log.joints("imu"):
+        return None
     if not all(log.has("imu", a) for a in names):
         lost.append("no accelerometer: the velocity between two stances is interpolated")
         return None

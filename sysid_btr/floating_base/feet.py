@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
+from sysid_btr.identify.smoothing import Tracks
 from sysid_btr.mujoco_conventions import free_joints
 
 if TYPE_CHECKING:
@@ -32,6 +33,23 @@ class Foot:
     name: str
     points: FloatArray
     radius: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class FeetMotion:
+    """Where the points of the feet are, and how they move, in the frame of the base.
+
+    Attributes
+    ----------
+    feet : whose points they are.
+    points, moving : (n, k, 3) of each foot, m, and m/s.
+    between : (j,) whether a joint lies between the base and a foot.
+    """
+
+    feet: tuple[Foot, ...]
+    points: list[FloatArray]
+    moving: list[FloatArray]
+    between: BoolArray
 
 
 def touching_bodies(model: mujoco.MjModel) -> tuple[Foot, ...]:
@@ -115,6 +133,25 @@ def points_in_base(
             world = foot.points @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
             points[k] = (world - origin) @ frame
     return result
+
+
+def feet_motion(
+    model: mujoco.MjModel, feet: Sequence[Foot], addresses: IntArray, joints: Tracks, moment: float
+) -> FeetMotion:
+    """The motion of the feet that the joints make.
+
+    Parameters
+    ----------
+    model : with a free base as its first joint.
+    addresses, joints : addresses in qpos, (j,), and motion of the joints.
+    moment : s, over which velocities are differences.
+    """
+    here = points_in_base(model, feet, addresses, joints.position)
+    ahead = points_in_base(model, feet, addresses, joints.position + moment * joints.velocity)
+    moving = [(later - points) / moment for points, later in zip(here, ahead, strict=True)]
+    bodies = {body for foot in feet for body in up_to_base(model, model.body(foot.name).id)}
+    bearing = [model.jnt_qposadr[j] for j in range(model.njnt) if model.jnt_bodyid[j] in bodies]
+    return FeetMotion(tuple(feet), here, moving, np.isin(addresses, bearing))
 
 
 def base_body(model: mujoco.MjModel) -> int:

@@ -20,11 +20,6 @@ def rotation_of(vector: FloatArray) -> FloatArray:
     return np.asarray(flat.reshape(*np.shape(vector)[:-1], 3, 3))
 
 
-def up_in_base(angle_x: FloatArray, angle_y: FloatArray) -> FloatArray:
-    """World's vertical in the base's frame, (n, 3), for roll about x after pitch about y after yaw about z."""
-    return np.stack([-np.sin(angle_y), np.cos(angle_y) * np.sin(angle_x), np.cos(angle_y) * np.cos(angle_x)], axis=1)
-
-
 def smooth_orientation(
     time: FloatArray, gyro: FloatArray, up: FloatArray, gyro_std: float, up_std: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -153,8 +153,8 @@ def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
     suited = _kind("innovations").suits(robot, log)
     if mode.asked == "innovations" and not suited:
         raise UsageError(
-            f"--mode innovations cannot be used with {log.path or 'the log'}: it needs samples at equal intervals and "
-            "drives without memory. Compare it by segments: --mode segments"
+            f"--mode innovations cannot be used with {log.path or 'the log'}: it needs an inertial unit, samples at "
+            "equal intervals and drives without memory. Compare it by segments: --mode segments"
         )
     if mode.asked == "innovations":
         return "innovations", "as asked for"
