@@ -14,17 +14,9 @@ from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.joining import as_curves
 from sysid_btr.diagnosis.leads import Library
-from sysid_btr.diagnosis.selection import (
-    Selection,
-    agree,
-    distance_from_nothing,
-    doubtful_location,
-    is_dispensable,
-    is_needed,
-    predicts_as_well,
-)
+from sysid_btr.diagnosis.selection import Selection, agree, distance_from_nothing, doubtful_location, is_needed
 from sysid_btr.diagnosis.state import State
-from sysid_btr.diagnosis.trials import Trial, attempt
+from sysid_btr.diagnosis.trials import Trial, attempt, is_wanted
 from sysid_btr.diagnosis.uncertainty import with_intervals
 from sysid_btr.estimators.base import Progress, without_loss
 from sysid_btr.identify.refit import inflate, refit, shorten
@@ -80,12 +72,7 @@ def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[T
         smaller = replace(trial.hypothesis, places=tuple(places[i] for i in rest), start=amounts[rest].ravel())
         fewer = attempt(study, model.without(group), smaller, rules)
         spent += fewer.fitted.evaluations
-        loss = (
-            fewer.fitted.misfit_everywhere - trial.fitted.misfit_everywhere
-            if effect.transient
-            else fewer.fitted.misfit - trial.fitted.misfit
-        )
-        if not is_dispensable(rules, float(size[least]), float(size.max()), loss):
+        if size[least] > rules.idle * size.max() and is_wanted(rules, fewer.fitted, trial):
             break
         trial = fewer
     return trial, spent
@@ -102,7 +89,7 @@ def _pruned(state: State, rules: Selection) -> State:
         if not is_needed(rules, trial, state.fitted):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
             state = replace(state, fitted=trial, evidence=state.without_evidence_of(effect))
-    for effect in state.effects if len(state.effects) > 1 else ():
+    for effect in state.effects if found else ():
         state, dropped = _at_fewer_locations(state, effect, rules)
         if dropped:
             removed.append(f"{effect.name} at {', '.join(dropped)}")
@@ -147,28 +134,31 @@ def _merged(state: State, rules: Selection) -> State:
 
 
 def _distinguishable_from_nothing(state: State, library: Library, rules: Selection) -> State | None:
-    """The model without effects, and locations of effects, whose amounts may be nothing; None where there are none.
+    """The model without what may be nothing, and locations with a small part of it; None where there are none.
 
     Only what held-out data do not miss is dropped: of two effects that a log shows together but cannot distinguish, one
     stays. Of what they do miss a special case may be enough: friction that falls with speed by nothing is dry friction.
     """
-    doubtful: list[tuple[float, Effect, list[int]]] = []
+    doubtful: list[tuple[float, Effect, list[tuple[int, ...]]]] = []
     for effect in state.effects:
         own = state.estimates[state.fitted.model.terms.columns(effect)]
         main = slice(effect.main, None, len(effect.kinds))
-        distance = [distance_from_nothing(e, n) for e, n in zip(own[main], effect.neutral[main], strict=True)]
-        kept = [i for i, d in enumerate(distance) if np.isinf(d)]
-        if len(kept) < len(distance):
-            doubtful.append((min(distance), effect, kept))
+        pairs = list(zip(own[main], effect.neutral[main], strict=True))
+        distance = [distance_from_nothing(found, nothing) for found, nothing in pairs]
+        size = [abs(found.value - nothing) for found, nothing in pairs]
+        real = tuple(i for i, d in enumerate(distance) if np.isinf(d))
+        # what the others left while they were unknown is small now
+        large = tuple(i for i in real if size[i] > rules.doubtful * max(size))
+        if len(large) < len(pairs):
+            doubtful.append((min(distance), effect, [k for k in dict.fromkeys((large, real)) if len(k) < len(pairs)]))
     result: State | None = None
     now = state
-    for _, effect, kept in sorted(doubtful, key=lambda item: item[0]):
-        at, simpler = now.effects.index(effect), _special_cases(effect, library, now)
-        if kept or len(now.effects) > 1:
-            simpler.insert(0, _at_locations(effect, kept, now))
-        for left in simpler:
+    for _, effect, fewer in sorted(doubtful, key=lambda item: item[0]):
+        at = now.effects.index(effect)
+        simpler = [_at_locations(effect, list(kept), now) for kept in fewer if kept or len(now.effects) > 1]
+        for left in (*simpler, *_special_cases(effect, library, now)):
             fitted = refit(now.study, now.fitted.model.replaced(effect, *left), polish=True)
-            if predicts_as_well(rules, fitted, state.fitted):
+            if not is_needed(rules, fitted, state.fitted):
                 known = (*now.evidence[:at], *((now.evidence[at],) if left else ()), *now.evidence[at + 1 :])
                 result = now = replace(now, fitted=fitted, evidence=known)
                 break
