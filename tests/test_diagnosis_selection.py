@@ -22,6 +22,7 @@ from sysid_btr.diagnosis.selection import (
     all_explained,
     at_floor,
     column_limit,
+    could_gain,
     distance_from_nothing,
     doubtful_location,
     explains_fitted,
@@ -29,11 +30,9 @@ from sysid_btr.diagnosis.selection import (
     hidden_columns,
     improves,
     improves_once,
-    is_dispensable,
     is_explained,
     is_log_explained,
     is_needed,
-    predicts_as_well,
     something_left,
     verdict_limit,
 )
@@ -293,6 +292,14 @@ def test_is_needed(without: Fitted, now: Fitted, expected: bool) -> None:
     assert is_needed(RULES, without, now) == expected
 
 
+def test_could_gain() -> None:
+    """An excess of 0.3 % of the first one allows a law, which must remove 0.2 %, and no curve, which must 2.5 %."""
+    first, now = fitted([1001.0]), fitted([4.0])
+    assert could_gain(RULES, first, now)
+    assert not could_gain(RULES, first, now, learnt=True)
+    assert not could_gain(RULES, first, fitted([1.5]))
+
+
 # --- locations and amounts ----------------------------------------------------------------------------------------
 
 
@@ -301,14 +308,6 @@ def test_is_needed(without: Fitted, now: Fitted, expected: bool) -> None:
 )
 def test_doubtful_location(size: Numbers, expected: int | None) -> None:
     assert doubtful_location(RULES, np.array(size)) == expected
-
-
-@pytest.mark.parametrize(
-    ("size", "loss", "expected"),
-    [(0.0009, 5.0, True), (0.0011, 5.0, False), (0.4, 0.05, True), (0.4, 0.07, False), (0.4, -1.0, True)],
-)
-def test_is_dispensable(size: float, loss: float, expected: bool) -> None:
-    assert is_dispensable(RULES, size, 1.0, loss) is expected
 
 
 @pytest.mark.parametrize(
@@ -343,11 +342,6 @@ def estimate(value: float, std: float, *, identifiable: str = "yes") -> Estimate
 )
 def test_distance_from_nothing(found: Estimate, neutral: float, expected: float) -> None:
     assert distance_from_nothing(found, neutral) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(("without", "expected"), [([2.0], True), ([2.3], True), ([2.35], False), ([1.0], True)])
-def test_predicts_as_well(without: Numbers, expected: bool) -> None:
-    assert predicts_as_well(RULES, fitted(without), fitted([2.0])) is expected
 
 
 # --- which trials are made, and which one wins ----------------------------------------------------------------------

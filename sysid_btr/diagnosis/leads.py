@@ -14,7 +14,7 @@ from sysid_btr.diagnosis.free_form import free_forms
 from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_together, form_hypotheses, from_arrays, to_arrays
 from sysid_btr.diagnosis.proposals import proposals
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, perturbations, responding, scan
-from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.selection import Selection, could_gain
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.journal import Record
 from sysid_btr.estimators.linearisation import linearise
@@ -42,7 +42,8 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
     began = perf_counter()
     found, residuals = _scan(state, [e for e in library if e not in FREE_FORMS], rules)
     hypotheses = form_hypotheses(found, residuals, state.study.scales, rules)
-    hypotheses += curves_of(state.study, state.fitted.model, library, rules)
+    if could_gain(rules, state.before, state.fitted, learnt=bool(state.effects)):
+        hypotheses += curves_of(state.study, state.fitted.model, library, rules)
     if study.journal is not None:
         arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
         seconds = study.journal.seconds + perf_counter() - began

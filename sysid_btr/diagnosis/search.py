@@ -16,6 +16,7 @@ from sysid_btr.diagnosis.selection import (
     Selection,
     all_explained,
     at_floor,
+    could_gain,
     has_minimum_gain,
     improves,
     is_log_explained,
@@ -58,7 +59,8 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
     """
     sure, doubtful = state, list[Hypothesis]()
     for number in range(1, rules.rounds + 1):
-        if at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted):
+        enough = at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted)
+        if enough or not could_gain(rules, state.before, state.fitted):
             break
         if number == OWN_STEPS_FROM:
             tried = _in_own_steps(state, library, rules, progress)

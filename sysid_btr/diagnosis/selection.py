@@ -6,7 +6,7 @@ compare hypotheses with one another are in `sysid_btr.diagnosis.trials`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -268,6 +268,12 @@ def has_minimum_gain(
     return bool(np.nanmax((before.columns - after.columns) / excess) >= least)
 
 
+def could_gain(rules: Selection, first: Fitted, now: Fitted, *, transient: bool = False, learnt: bool = False) -> bool:
+    """Whether an effect would remove more than that trace if it left nothing of any column."""
+    nothing = replace(now, columns=np.zeros_like(now.columns))
+    return has_minimum_gain(rules, first, now, nothing, transient=transient, learnt=learnt)
+
+
 def improves(rules: Selection, before: Fitted, after: Fitted) -> bool:
     """Whether the improvement on held-out data is large and not by chance, and one of fitted data too."""
     drop = (before.holdout - after.holdout) / before.holdout
@@ -306,11 +312,6 @@ def doubtful_location(rules: Selection, size: FloatArray) -> int | None:
     return None if size[least] > rules.doubtful * size.max() else least
 
 
-def is_dispensable(rules: Selection, size: float, largest: float, loss: float) -> bool:
-    """Whether a location goes: there is nothing, or leaving it out loses no more misfit than simplicity is worth."""
-    return size <= rules.idle * largest or loss <= rules.simpler
-
-
 def agree(amounts: FloatArray, spread: float) -> bool:
     """Whether amounts (n,) differ from their median by no more than a fraction of it."""
     middle = float(np.median(amounts))
@@ -329,11 +330,6 @@ def distance_from_nothing(found: Estimate, neutral: float) -> float:
 def differs_from(found: Estimate, neutral: float) -> bool:
     """Whether an amount is identifiable and its interval leaves out the value that does nothing."""
     return found.identifiable != "no" and not found.ci95[0] <= neutral <= found.ci95[1]
-
-
-def predicts_as_well(rules: Selection, without: Fitted, now: Fitted) -> bool:
-    """Whether held-out data do not miss what may be nothing."""
-    return without.misfit <= now.misfit + rules.rival
 
 
 # --- verdict --------------------------------------------------------------------------------------------------
