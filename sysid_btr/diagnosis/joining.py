@@ -6,6 +6,7 @@ stop, a spring beside it, and more beside these.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 
@@ -29,19 +30,20 @@ def as_curves(state: State, library: Library, rules: Selection) -> State:
     """
     if state.study.procedure.costly:
         return state
-    for laws in _together(state):
+    for laws in of_one_cause(state.effects):
         if not at_floor(rules, state.fitted):
             state = _as_curve(state, laws, library, rules)
     return state
 
 
-def _together(state: State) -> list[tuple[Effect, ...]]:
-    """Laws that are of one family, at one joint and at no other."""
+def of_one_cause(effects: Sequence[Effect]) -> list[tuple[Effect, ...]]:
+    """Of some effects laws, and curves that took up the rest of them, of one family at one joint and at no other."""
     groups: dict[tuple[str, tuple[str, ...]], list[Effect]] = {}
-    for effect in state.effects:
-        if type(effect) not in FREE_FORMS and len(effect.places) == 1:
+    for effect in effects:
+        if len(effect.places) == 1:
             groups.setdefault((family_of(type(effect)), effect.places), []).append(effect)
-    return [tuple(laws) for laws in groups.values() if len(laws) > 1]
+    several = (tuple(laws) for laws in groups.values() if len(laws) > 1)
+    return [laws for laws in several if any(type(law) not in FREE_FORMS for law in laws)]
 
 
 def _as_curve(state: State, laws: tuple[Effect, ...], library: Library, rules: Selection) -> State:
