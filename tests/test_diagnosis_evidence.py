@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.diagnosis.certainty import STANDARD
-from sysid_btr.diagnosis.evidence import evidence_of, left_where_it_acts, preference, share_explained, weights
+from sysid_btr.diagnosis.evidence import (
+    evidence_of,
+    is_missed,
+    left_where_it_acts,
+    preference,
+    share_explained,
+    weights,
+)
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import STANDARD as RULES
 from sysid_btr.diagnosis.trials import Trial
@@ -92,6 +99,15 @@ def test_the_weight_of_a_clear_difference_is_that_of_the_likelihood() -> None:
     a, b = left(even(2.0), memory=100.0), left(even(2.1), memory=100.0)
     odds = 0.5 * 20 * COUNT / 100 * np.log(2.1 / 2.0)
     np.testing.assert_allclose(weights([a, b], a, [1, 1])[0], 1 / (1 + np.exp(-odds)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("without", "expected"),
+    [(4.2, False), (4.4, True), (3.8, False)],
+    ids=["worth no place", "missed", "better without"],
+)
+def test_what_is_left_out_is_missed_where_it_is_worth_a_place(without: float, expected: bool) -> None:
+    assert is_missed(RULES, left(even(without)), left(even(4.0))) == expected
 
 
 def test_many_samples_of_a_wrong_model_are_little_evidence() -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import nan
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.evidence import Evidence
+from sysid_btr.diagnosis.evidence import Evidence, is_missed
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.joining import as_curves
@@ -19,10 +19,12 @@ from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt, is_wanted
 from sysid_btr.diagnosis.uncertainty import with_intervals
 from sysid_btr.estimators.base import Progress, without_loss
-from sysid_btr.identify.refit import inflate, refit, shorten
+from sysid_btr.identify.refit import Fitted, inflate, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import Effect
 
+Wanted = Callable[[Selection, Fitted, Fitted], bool]
+"""Whether data want what a model lacks against another one."""
 SETTLED = 0.01
 """Change of the misfit, as a fraction, below which states and parameters are no longer updated in turn."""
 
@@ -72,7 +74,10 @@ def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[T
         smaller = replace(trial.hypothesis, places=tuple(places[i] for i in rest), start=amounts[rest].ravel())
         fewer = attempt(study, model.without(group), smaller, rules)
         spent += fewer.fitted.evaluations
-        if size[least] > rules.idle * size.max() and is_wanted(rules, fewer.fitted, trial):
+        missed = (
+            is_wanted(rules, fewer.fitted, trial) if effect.transient else is_missed(rules, fewer.fitted, trial.fitted)
+        )
+        if missed and size[least] > rules.idle * size.max():
             break
         trial = fewer
     return trial, spent
@@ -139,7 +144,7 @@ def _distinguishable_from_nothing(state: State, library: Library, rules: Selecti
     Only what held-out data do not miss is dropped: of two effects that a log shows together but cannot distinguish, one
     stays. Of what they do miss a special case may be enough: friction that falls with speed by nothing is dry friction.
     """
-    doubtful: list[tuple[float, Effect, list[tuple[int, ...]]]] = []
+    doubtful: list[tuple[float, Effect, list[tuple[tuple[int, ...], Wanted]]]] = []
     for effect in state.effects:
         own = state.estimates[state.fitted.model.terms.columns(effect)]
         main = slice(effect.main, None, len(effect.kinds))
@@ -149,16 +154,20 @@ def _distinguishable_from_nothing(state: State, library: Library, rules: Selecti
         real = tuple(i for i, d in enumerate(distance) if np.isinf(d))
         # what the others left while they were unknown is small now
         large = tuple(i for i in real if size[i] > rules.doubtful * max(size))
+        # what may be nothing stays as an effect is added, what is small where the log says that it is there
+        asked: dict[tuple[int, ...], Wanted] = {large: is_missed, real: is_needed}
         if len(large) < len(pairs):
-            doubtful.append((min(distance), effect, [k for k in dict.fromkeys((large, real)) if len(k) < len(pairs)]))
+            doubtful.append((min(distance), effect, [(k, w) for k, w in asked.items() if len(k) < len(pairs)]))
     result: State | None = None
     now = state
     for _, effect, fewer in sorted(doubtful, key=lambda item: item[0]):
         at = now.effects.index(effect)
-        simpler = [_at_locations(effect, list(kept), now) for kept in fewer if kept or len(now.effects) > 1]
-        for left in (*simpler, *_special_cases(effect, library, now)):
+        others = len(now.effects) > 1
+        may_do = [(_at_locations(effect, list(kept), now), wanted) for kept, wanted in fewer if kept or others]
+        may_do += [(simpler, is_missed) for simpler in _special_cases(effect, library, now)]
+        for left, wanted in may_do:
             fitted = refit(now.study, now.fitted.model.replaced(effect, *left), polish=True)
-            if not is_needed(rules, fitted, state.fitted):
+            if not wanted(rules, fitted, state.fitted):
                 known = (*now.evidence[:at], *((now.evidence[at],) if left else ()), *now.evidence[at + 1 :])
                 result = now = replace(now, fitted=fitted, evidence=known)
                 break

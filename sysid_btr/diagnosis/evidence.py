@@ -97,6 +97,13 @@ def preference(before: Fitted, after: Fitted) -> float:
     return float(_shares(pair, np.zeros(2))[1])
 
 
+def is_missed(rules: Selection, without: Fitted, now: Fitted) -> bool:
+    """Whether data miss what was left out: by more than simplicity is worth, and the model with it is likelier."""
+    more = len(now.model.values) - len(without.model.values)
+    worth = without.misfit - now.misfit > rules.simpler
+    return worth and bool(weights([without, now], now, [0, more])[1] >= rules.evident)
+
+
 def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -> FloatArray:
     """Pseudo-BMA+ weights (m,) of models of the same data.
 
