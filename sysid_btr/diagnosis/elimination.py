@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import nan
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.diagnosis.evidence import Evidence, is_missed
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.joining import as_curves
 from sysid_btr.diagnosis.leads import Library
-from sysid_btr.diagnosis.selection import Selection, agree, distance_from_nothing, doubtful_location, is_needed
+from sysid_btr.diagnosis.selection import (
+    Selection,
+    agree,
+    distance_from_nothing,
+    doubtful_location,
+    is_needed,
+    is_small,
+)
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt, is_wanted
 from sysid_btr.diagnosis.uncertainty import with_intervals
@@ -24,7 +31,7 @@ from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import Effect
 
 Wanted = Callable[[Selection, Fitted, Fitted], bool]
-"""Whether data want what a model lacks against another one."""
+"""Whether data want what the first model lacks of the second."""
 SETTLED = 0.01
 """Change of the misfit, as a fraction, below which states and parameters are no longer updated in turn."""
 
@@ -139,39 +146,61 @@ def _merged(state: State, rules: Selection) -> State:
 
 
 def _distinguishable_from_nothing(state: State, library: Library, rules: Selection) -> State | None:
-    """The model without what may be nothing, and locations with a small part of it; None where there are none.
+    """The model without what may be nothing, and locations with a small amount; None where all of it is wanted.
 
-    Only what held-out data do not miss is dropped: of two effects that a log shows together but cannot distinguish, one
-    stays. Of what they do miss a special case may be enough: friction that falls with speed by nothing is dry friction.
+    Only what data do not miss is dropped: of two effects that a log shows together but cannot distinguish, one stays.
+    Of what they do miss a special case may be enough: friction that falls with speed by nothing is dry friction.
     """
-    doubtful: list[tuple[float, Effect, list[tuple[tuple[int, ...], Wanted]]]] = []
-    for effect in state.effects:
-        own = state.estimates[state.fitted.model.terms.columns(effect)]
-        main = slice(effect.main, None, len(effect.kinds))
-        pairs = list(zip(own[main], effect.neutral[main], strict=True))
-        distance = [distance_from_nothing(found, nothing) for found, nothing in pairs]
-        size = [abs(found.value - nothing) for found, nothing in pairs]
-        real = tuple(i for i, d in enumerate(distance) if np.isinf(d))
-        # what the others left while they were unknown is small now
-        large = tuple(i for i in real if size[i] > rules.doubtful * max(size))
-        # what may be nothing stays as an effect is added, what is small where the log says that it is there
-        asked: dict[tuple[int, ...], Wanted] = {large: is_missed, real: is_needed}
-        if len(large) < len(pairs):
-            doubtful.append((min(distance), effect, [(k, w) for k, w in asked.items() if len(k) < len(pairs)]))
+    doubts = [doubt for effect in state.effects if (doubt := _doubt(effect, state, rules)).fewer]
     result: State | None = None
     now = state
-    for _, effect, fewer in sorted(doubtful, key=lambda item: item[0]):
+    for doubt in sorted(doubts, key=lambda doubt: doubt.distance):
+        effect, others = doubt.effect, len(now.effects) > 1
         at = now.effects.index(effect)
-        others = len(now.effects) > 1
-        may_do = [(_at_locations(effect, list(kept), now), wanted) for kept, wanted in fewer if kept or others]
-        may_do += [(simpler, is_missed) for simpler in _special_cases(effect, library, now)]
-        for left, wanted in may_do:
+        simpler = [(_at_locations(effect, kept, now), wanted) for kept, wanted in doubt.fewer if kept or others]
+        simpler += [(case, is_missed) for case in _special_cases(effect, library, now)]
+        for left, wanted in simpler:
             fitted = refit(now.study, now.fitted.model.replaced(effect, *left), polish=True)
             if not wanted(rules, fitted, state.fitted):
                 known = (*now.evidence[:at], *((now.evidence[at],) if left else ()), *now.evidence[at + 1 :])
                 result = now = replace(now, fitted=fitted, evidence=known)
                 break
     return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Doubt:
+    """An effect of which less may do.
+
+    Attributes
+    ----------
+    effect : of the model.
+    distance : standard deviations from nothing of its least amount.
+    fewer : locations, by position, at which alone it may do, fewest first, and what must not hold for that.
+    """
+
+    effect: Effect
+    distance: float
+    fewer: tuple[tuple[list[int], Wanted], ...]
+
+
+def _doubt(effect: Effect, state: State, rules: Selection) -> _Doubt:
+    """What there is to doubt of an effect; nothing where all of its amounts are large and differ from nothing.
+
+    At a location where the amount may be nothing it is wanted as an effect is that is added; where it is small, as what
+    others left while they were unknown is by now, if the log misses it.
+    """
+    own = state.estimates[state.fitted.model.terms.columns(effect)]
+    main = slice(effect.main, None, len(effect.kinds))
+    pairs = list(zip(own[main], effect.neutral[main], strict=True))
+    distance = np.array([distance_from_nothing(found, nothing) for found, nothing in pairs])
+    size = np.array([abs(found.value - nothing) for found, nothing in pairs])
+    real = np.isinf(distance)
+    large = real & ~is_small(rules, size)
+    asked: list[tuple[BoolArray, Wanted]] = [] if np.array_equal(large, real) else [(large, is_missed)]
+    asked.append((real, is_needed))
+    fewer = tuple((np.flatnonzero(kept).tolist(), wanted) for kept, wanted in asked if not kept.all())
+    return _Doubt(effect, float(distance.min()), fewer)
 
 
 def _special_cases(effect: Effect, library: Library, state: State) -> list[list[tuple[Effect, FloatArray]]]:

@@ -1,7 +1,7 @@
-"""Several laws of one family at a joint, of which a curve may say all at once.
+"""Several effects of one family at a joint, of which a curve may say all at once.
 
-Laws are added one at a time, and the next takes up what the form of the one before leaves: a spring that hardens is a
-stop, a spring beside it, and more beside these.
+Laws are added one at a time, and the next, or a curve, takes up what the form of the one before leaves: a spring that
+hardens is a stop, a spring beside it, and more beside these.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sysid_btr.terms.free_form import FREE_FORMS
 
 
 def as_curves(state: State, library: Library, rules: Selection) -> State:
-    """The state with a curve in the place of several laws of its family at a joint, of whose error it leaves little.
+    """The state with a curve in the place of effects of its family at a joint, where it leaves little of their error.
 
     Parameters
     ----------
@@ -30,9 +30,9 @@ def as_curves(state: State, library: Library, rules: Selection) -> State:
     """
     if state.study.procedure.costly:
         return state
-    for laws in of_one_cause(state.effects):
+    for group in of_one_cause(state.effects):
         if not at_floor(rules, state.fitted):
-            state = _as_curve(state, laws, library, rules)
+            state = _as_curve(state, group, library, rules)
     return state
 
 
@@ -42,13 +42,13 @@ def of_one_cause(effects: Sequence[Effect]) -> list[tuple[Effect, ...]]:
     for effect in effects:
         if len(effect.places) == 1:
             groups.setdefault((family_of(type(effect)), effect.places), []).append(effect)
-    several = (tuple(laws) for laws in groups.values() if len(laws) > 1)
-    return [laws for laws in several if any(type(law) not in FREE_FORMS for law in laws)]
+    several = (tuple(group) for group in groups.values() if len(group) > 1)
+    return [group for group in several if any(type(one) not in FREE_FORMS for one in group)]
 
 
-def _as_curve(state: State, laws: tuple[Effect, ...], library: Library, rules: Selection) -> State:
-    family, places = family_of(type(laws[0])), laws[0].places
-    bare = state.fitted.model.without(*laws)
+def _as_curve(state: State, group: tuple[Effect, ...], library: Library, rules: Selection) -> State:
+    family, places = family_of(type(group[0])), group[0].places
+    bare = state.fitted.model.without(*group)
     found = curves_of(state.study, bare, library, rules)
     curve = next((h for h in found if family_of(h.effect) == family and h.places == places), None)
     if curve is None or not bare.terms.admit(curve.effect, places):
@@ -58,13 +58,13 @@ def _as_curve(state: State, laws: tuple[Effect, ...], library: Library, rules: S
     if not _leaves_little(trial.fitted, state.fitted, rules):
         return state
     known = list(zip(state.effects, state.evidence, strict=True))
-    own = reduce(Evidence.joined, (evidence for effect, evidence in known if effect in laws))
-    staying = tuple(evidence for effect, evidence in known if effect not in laws)
+    own = reduce(Evidence.joined, (evidence for effect, evidence in known if effect in group))
+    staying = tuple(evidence for effect, evidence in known if effect not in group)
     state = replace(state, fitted=trial.fitted, evidence=(*staying, own))
-    return state.step(added=(str(curve),), removed=[f"{law.name} at {', '.join(places)}" for law in laws])
+    return state.step(added=(str(curve),), removed=[f"{one.name} at {', '.join(places)}" for one in group])
 
 
-def _leaves_little(curve: Fitted, laws: Fitted, rules: Selection) -> bool:
-    """Whether a curve explains most of what laws leave above the noise, fitted and held out."""
-    parts = ((curve.train, laws.train), (curve.holdout, laws.holdout))
+def _leaves_little(curve: Fitted, several: Fitted, rules: Selection) -> bool:
+    """Whether a curve explains most of what several effects leave above the noise, fitted and held out."""
+    parts = ((curve.train, several.train), (curve.holdout, several.holdout))
     return all(after - 1 <= rules.joins * (before - 1) for after, before in parts)

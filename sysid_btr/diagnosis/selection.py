@@ -306,10 +306,15 @@ def is_needed(rules: Selection, without: Fitted, now: Fitted) -> bool:
 # --- locations and amounts ----------------------------------------------------------------------------------------
 
 
+def is_small(rules: Selection, size: FloatArray) -> BoolArray:
+    """Which locations of a group have a small amount beside the largest, by the size of each, (n,)."""
+    return np.asarray(size <= rules.doubtful * size.max())
+
+
 def doubtful_location(rules: Selection, size: FloatArray) -> int | None:
     """The location with the least amount, of those of a group (n,), if it is small beside the largest."""
     least = int(np.argmin(size))
-    return None if size[least] > rules.doubtful * size.max() else least
+    return least if is_small(rules, size)[least] else None
 
 
 def agree(amounts: FloatArray, spread: float) -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError
 from sysid_btr.floating_base.feet import FeetMotion, base_body
 from sysid_btr.floating_base.orientation import rotation_of
@@ -147,22 +147,13 @@ def of_feet(
     size : of the robot.
     """
     n, step = len(time), np.append(np.diff(time), 0.0)
-    up, up_std, turning = np.empty((n, 3)), np.full(n, np.inf), np.zeros((n, 3))
-    near, flat = size.length(NEAR), size.length(FLAT)
+    up, up_std, turning = np.empty((n, 3)), np.empty(n), np.empty((n, 3))
     every, motion = np.concatenate(feet.points, axis=1), np.concatenate(feet.moving, axis=1)
     radius = np.concatenate([foot.radius for foot in feet.feet])
     now = resting(model, addresses, joints.position[0], every[0], radius)
     for k, (points, moving) in enumerate(zip(every, motion, strict=True)):
-        for _ in range(2):
-            height = points @ now - radius
-            low = height < height.min() + near
-            touching = points[low] - radius[low, None] * now
-            _, extent, axes = np.linalg.svd(touching - touching.mean(axis=0))
-            if len(touching) < 3 or extent[1] < flat:
-                break
-            now = axes[2] * np.sign(axes[2] @ now)
-            up_std[k] = size.length(HEIGHT_STD) / extent[1]
-        up[k], turning[k] = now, turning_over(touching, moving[low])
+        now, up_std[k], low = _levelled(now, points, radius, size)
+        up[k], turning[k] = now, turning_over(points[low], moving[low])
         now = now + step[k] * np.cross(now, turning[k])
         now /= np.linalg.norm(now)
     # all joints between the base and the ground err, and others do not count
@@ -171,6 +162,26 @@ def of_feet(
     faster = np.asarray(np.gradient(turning, time, axis=0))
     rates = Tracks(turning, faster, np.zeros((n, 3)), std, np.full((n, 3), np.inf))
     return Attitude(turning, std, rates, up, up_std, SOLE_STD)
+
+
+def _levelled(
+    up: FloatArray, points: FloatArray, radius: FloatArray, size: BodySize
+) -> tuple[FloatArray, float, BoolArray]:
+    """The vertical (3,) for which what is lowest near another one lies level, its error, and which points these are.
+
+    The error is infinite, and the vertical the other one, where too little touches to tell it.
+    """
+    std = np.inf
+    for _ in range(2):
+        height = points @ up - radius
+        low = height < height.min() + size.length(NEAR)
+        touching = points[low] - radius[low, None] * up
+        _, extent, axes = np.linalg.svd(touching - touching.mean(axis=0))
+        if len(touching) < 3 or extent[1] < size.length(FLAT):
+            break
+        up = axes[2] * np.sign(axes[2] @ up)
+        std = size.length(HEIGHT_STD) / float(extent[1])
+    return up, std, np.asarray(low)
 
 
 def resting(

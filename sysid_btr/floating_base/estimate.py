@@ -330,10 +330,9 @@ def foot_loads(model: mujoco.MjModel, feet: Sequence[Foot], log: Log, lost: list
 def _specific_force(model: mujoco.MjModel, log: Log, rates: Tracks, lost: list[str]) -> tuple[FloatArray, float] | None:
     """Specific force at the base's origin in its frame, (n, 3), and its noise; None without accelerometer."""
     names = ("acc_x", "acc_y", "acc_z")
-    if not log.joints("imu"):
-        return None
     if not all(log.has("imu", a) for a in names):
-        lost.append("no accelerometer: the velocity between two stances is interpolated")
+        if log.joints("imu"):
+            lost.append("no accelerometer: the velocity between two stances is interpolated")
         return None
     force = imu_columns(log, names)
     noise = float(np.mean([noise_floor(c).sigma for c in force.T]))
