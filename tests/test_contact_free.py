@@ -22,7 +22,8 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
 from sysid_btr.objectives.covariance import Known
 from sysid_btr.objectives.problem import ReplayProblem
-from sysid_btr.simulation.segments import BASE, BaseStates, Segments
+from sysid_btr.simulation.base_states import BASE, BaseStates
+from sysid_btr.simulation.segments import Segments
 
 OnSprings = tuple[ground.Walker, Study, ReplayProblem, np.ndarray]
 MASSES = ["mass:*KneePitch,*HipPitch,*HipRoll,*ShoulderRoll", "kp:*=shared", "kv:*=shared"]

@@ -33,11 +33,12 @@ from sysid_btr.identify.numerics import CHECK_SECONDS, choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.simulation import mujoco_batch
 from sysid_btr.simulation import replay as replay_module
+from sysid_btr.simulation.base_states import BaseStates
 from sysid_btr.simulation.batching import batched_chunks, group_replays
 from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps, step_inputs
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
-from sysid_btr.simulation.segments import BaseStates, SegmentReplay, Segments
+from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.simulation.start import initial_state
 from sysid_btr.terms.friction import CoulombFriction, StribeckFriction
 from sysid_btr.terms.grammar import parse_parameters

@@ -36,8 +36,9 @@ from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
 from sysid_btr.objectives.marginal import Marginal, projections
 from sysid_btr.objectives.targets import Target
+from sysid_btr.simulation.base_states import BASE, BaseStates, on_slope
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.simulation.segments import BASE, BaseStates, Segments, covered, on_slope, segment_seconds
+from sysid_btr.simulation.segments import Segments, covered, segment_seconds
 from sysid_btr.terms.contact import FootCompliance, FootFriction
 from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect

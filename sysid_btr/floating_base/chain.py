@@ -25,9 +25,10 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.noise import noise_floor
 from sysid_btr.mujoco_conventions import to_rotation
 from sysid_btr.objectives.problem import BLOCK
+from sysid_btr.simulation.base_states import BASE, BaseStates, free_addresses
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid
-from sysid_btr.simulation.segments import BASE, BaseStates, SegmentReplay, Segments
+from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.simulation.setup import Setup, Values
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.friction import CoulombFriction
@@ -109,7 +110,7 @@ class SampleSteps(FloatingReplay):
 
     @cached_property
     def index(self) -> JointAddresses:
-        return replace(make_index(self.model), base=self._free_joint)
+        return replace(make_index(self.model), base=free_addresses(self.model))
 
     @cached_property
     def grid(self) -> Grid:
@@ -474,7 +475,7 @@ def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
     steps, states = chain.steps, chain.states
     model, index = _written(steps, values).candidate(0), steps.index
     data = mujoco.MjData(model)
-    place, motion = steps._free_joint
+    place, motion = free_addresses(steps.model)
     order = np.concatenate([motion + np.arange(6), index.dof])
     joints = len(index.joints)
     rows = np.concatenate([np.arange(6, BASE), BASE + joints + np.arange(joints)])

@@ -57,8 +57,9 @@ from sysid_btr.objectives.marginal import Projection
 from sysid_btr.objectives.problem import BLOCK, Comparison
 from sysid_btr.objectives.targets import Target
 from sysid_btr.progress import mention, phase
+from sysid_btr.simulation.base_states import BASE, BaseStates
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
-from sysid_btr.simulation.segments import BASE, BaseStates, Segments
+from sysid_btr.simulation.segments import Segments
 from sysid_btr.terms.base import Outputs, Term
 from sysid_btr.terms.effect import GROUND
 from sysid_btr.terms.grammar import parse_parameters

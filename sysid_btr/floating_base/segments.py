@@ -19,16 +19,9 @@ from sysid_btr.io.noise import channel_noise
 from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import make_targets
+from sysid_btr.simulation.base_states import BASE, BaseStates
 from sysid_btr.simulation.numerics import MUJOCO, Numerics
-from sysid_btr.simulation.segments import (
-    BASE,
-    BaseStates,
-    SegmentReplay,
-    Segments,
-    covered,
-    segment_seconds,
-    spread_evenly,
-)
+from sysid_btr.simulation.segments import SegmentReplay, Segments, covered, segment_seconds, spread_evenly
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.simulation.base_states import BaseStates, place_base
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import write_terms
 from sysid_btr.simulation.silence import silenced
@@ -86,6 +87,9 @@ def _run(replays: Sequence[Replay], candidates: FloatArray) -> tuple[Outputs, ..
     )
     own_logs = [(r.log, g) for r, g in zip(replays, grids, strict=True)]
     setup = lead._prepare(batch, pairs, qpos, qvel, command, own_logs, extra)
+    bases = [r.base_start for r in replays if r.base_start is not None]
+    if bases:
+        place_base(setup, BaseStates.joined(bases).chosen(np.repeat(np.arange(logs), m)))
     # borders that any of the logs wants to see
     borders = np.unique(np.concatenate([grid.state for grid in grids]))
     states = lead.simulate(setup, borders)
@@ -110,6 +114,7 @@ def _joinable(a: Replay, b: Replay) -> bool:
         and a.effort == b.effort
         and a.threads == b.threads
         and a.log.meta.mount == b.log.meta.mount
+        and (a.base_start is None) == (b.base_start is None)
         and _input_names(a) == _input_names(b)
         and np.array_equal(a.index.scale, b.index.scale)
         and a.grid.extra.shape[1] == b.grid.extra.shape[1]

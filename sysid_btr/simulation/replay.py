@@ -18,6 +18,7 @@ from sysid_btr.memory import memory_limit, require_memory
 from sysid_btr.models.commands import commanded
 from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot
+from sysid_btr.simulation.base_states import BaseStates, free_addresses, place_base
 from sysid_btr.simulation.compiling import compile_model, made_elsewhere, make_index
 from sysid_btr.simulation.grid import Grid, at_samples, make_grid, step_inputs
 from sysid_btr.simulation.numerics import Numerics
@@ -52,6 +53,7 @@ class Replay:
     effort : whether servo torques are predicted too.
     threads : worker threads, 0 for all cores.
     begun : state from which it starts; None for that of the log's first samples.
+    base_start : state, one, from which a free base starts, whose motion is then recorded; None for the model's own.
     """
 
     robot: Robot
@@ -61,6 +63,7 @@ class Replay:
     effort: bool = False
     threads: int = 0
     begun: Start | None = field(default=None, kw_only=True)
+    base_start: BaseStates | None = field(default=None, kw_only=True)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -97,7 +100,8 @@ class Replay:
 
     @cached_property
     def index(self) -> JointAddresses:
-        return make_index(self.model)
+        index = make_index(self.model)
+        return index if self.base_start is None else replace(index, base=free_addresses(self.model))
 
     @cached_property
     def start(self) -> tuple[FloatArray, FloatArray]:
@@ -211,6 +215,8 @@ class Replay:
         batch = self.batch(pairs, m)
         qpos, qvel = behind_sensors(batch, pairs, self.shown, *(np.tile(start, (m, 1)) for start in self.start))
         setup = self._prepare(batch, pairs, qpos, qvel, command, ((self.log, grid),), extra)
+        if self.base_start is not None:
+            place_base(setup, self.base_start)
         return self._go(setup, pairs, grid)
 
     def batch(self, pairs: Values, size: int) -> BatchModel:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.mujoco_conventions import free_joints, to_quaternion, to_rotation
+from sysid_btr.simulation.base_states import BASE, BaseStates, place_base
 from sysid_btr.simulation.grid import Grid, step_inputs
 from sysid_btr.simulation.replay import CHUNK_DOFS, Replay
 from sysid_btr.simulation.setup import Setup, Values, prepare
@@ -36,41 +36,6 @@ WORTH = 0.8
 LEAD = 0.25
 """s of commands before a segment that reach into it when they are delayed, by a bus, whatever the robot's size; more
 where a term can delay them longer."""
-BASE = 12
-"""Numbers of a free base in a state: position, rotation, velocity, angular velocity, three each."""
-
-
-@dataclass(frozen=True, eq=False)
-class BaseStates:
-    """States of a free base.
-
-    Attributes
-    ----------
-    position, velocity : (w, 3) in the world, m and m/s.
-    quaternion : (w, 4), scalar first.
-    rate : (w, 3) angular velocity in the base's frame, rad/s.
-    """
-
-    position: FloatArray
-    quaternion: FloatArray
-    velocity: FloatArray
-    rate: FloatArray
-
-    def chosen(self, which: IntArray) -> BaseStates:
-        """Some of the states."""
-        return BaseStates(self.position[which], self.quaternion[which], self.velocity[which], self.rate[which])
-
-    def moved(self, change: FloatArray) -> BaseStates:
-        """Changed by small amounts, (w, 12), in position, rotation in the base's frame, velocity and rate."""
-        from scipy.spatial.transform import Rotation
-
-        turned = to_rotation(self.quaternion) * Rotation.from_rotvec(change[:, 3:6])
-        return BaseStates(
-            self.position + change[:, :3],
-            to_quaternion(turned),
-            self.velocity + change[:, 6:9],
-            self.rate + change[:, 9:12],
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,35 +107,6 @@ class Segments:
         if self.base is not None:
             back[:, :3], back[:, 3:6] = ago * self.base.velocity, ago * self.base.rate
         return self.moved(back)
-
-
-def on_slope(base: BaseStates, level: FloatArray, tilted: FloatArray) -> BaseStates:
-    """A base on a floor to which gravity is not normal.
-
-    The inertial unit knows the base's attitude to gravity, so where gravity is tilted in the floor's frame the base
-    is tilted with it, about the ground below it.
-
-    Parameters
-    ----------
-    base : on a level floor.
-    level : (3,) gravity normal to the floor.
-    tilted : (w, 3) gravity of each start.
-    """
-    from scipy.spatial.transform import Rotation
-
-    a = level / np.linalg.norm(level)
-    b = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
-    axis, cosine = np.cross(a, b), np.clip(b @ a, -1.0, 1.0)
-    sine = np.linalg.norm(axis, axis=1)
-    turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.where(sine > 0, sine, 1.0))[:, None])
-    below = base.position * [1.0, 1.0, 0.0]
-    turned = turn * to_rotation(base.quaternion)
-    return replace(
-        base,
-        position=below + turn.apply(base.position - below),
-        quaternion=to_quaternion(turned),
-        velocity=turn.apply(base.velocity),
-    )
 
 
 def segment_seconds(segments: Segments, log: Log) -> float:
@@ -394,12 +330,7 @@ class SegmentReplay(Replay):
             extra=self.grid.extra[rows],
         )
         if starts.base is not None:
-            base, (place, motion) = starts.base, self._free_joint
-            if "opt.gravity" in batch.fields:
-                base = on_slope(base, np.array(self.model.opt.gravity), batch.read("opt.gravity"))
-            qpos, qvel = setup.state["qpos"], setup.state["qvel"]
-            qpos[:, place : place + 3], qpos[:, place + 3 : place + 7] = base.position, base.quaternion
-            qvel[:, motion : motion + 3], qvel[:, motion + 3 : motion + 6] = base.velocity, base.rate
+            place_base(setup, starts.base)
         return replace(setup, state={**setup.state, **self.push(segment, change)})
 
     def lanes(self) -> list[list[tuple[int, IntArray]]]:
@@ -420,9 +351,3 @@ class SegmentReplay(Replay):
     def push(self, segment: IntArray, change: FloatArray | None) -> Fields:
         """Forces from outside on a batch of segments, as in MjData; none here."""
         return {}
-
-    @cached_property
-    def _free_joint(self) -> tuple[int, int]:
-        """Addresses of the free joint in qpos and in qvel."""
-        joint = int(free_joints(self.model)[0])
-        return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
