@@ -15,7 +15,7 @@ from benchmarks.robots.planted import DryFriction, Late, Planted
 from benchmarks.robots.regression import regress
 from benchmarks.robots.suite import Case, cases
 from sysid_btr.diagnosis.close import close
-from sysid_btr.floating_base.episode import FloatingEpisode
+from sysid_btr.floating_base.standing import StandingEpisode
 from sysid_btr.identify.inverse import InverseEpisode
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
@@ -54,7 +54,7 @@ def test_a_robot_that_stands_needs_no_inertial_unit(tmp_path: Path) -> None:
     case, log = short("standing")
     study = make_study(nominal(case, tmp_path), [log], threads=1)
     (episode,) = study.train
-    assert isinstance(episode, FloatingEpisode)
+    assert isinstance(episode, StandingEpisode)
     assert any("no inertial unit" in text for text in episode.base.lost)
     # its trunk leans by what hips, knees and ankles give, not more
     assert episode.base.tilt.max() < 0.15

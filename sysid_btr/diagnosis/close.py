@@ -123,14 +123,14 @@ def require_motion(study: Study) -> None:
 
 def usable_effects(effects: Sequence[type[Effect]], study: Study) -> tuple[type[Effect], ...]:
     """Effects that these logs could show at all, given mount and channels."""
-    floating = any(episode.procedure.leaves_ground_error for episode in study.train)
+    on_ground = any(episode.procedure.on_ground for episode in study.train)
     replayed = any(episode.procedure.replayed for episode in study.train)
     given = all(drives_nothing(episode.log, study.robot.for_log(episode.log).model) for episode in study.train)
     result = []
     for effect in filter(study.shows, effects):
         if given and effect.scope != "joint" and family_of(effect) in OF_DRIVES:
             continue
-        if effect.needs == (HELD_BASE if floating else GROUND) or (effect.needs == COMMANDS and not replayed):
+        if effect.needs == (HELD_BASE if on_ground else GROUND) or (effect.needs == COMMANDS and not replayed):
             continue
         if effect.needs == "effort" and not any(episode.logged(("effort",)) for episode in study.train):
             continue

@@ -61,6 +61,7 @@ class FloatingProcedure(Procedure):
     moves_split: ClassVar[bool] = False
     fuses: ClassVar[bool] = True
     costly: ClassVar[bool] = True
+    on_ground: ClassVar[bool] = True
     leaves_ground_error: ClassVar[bool] = True
     tolerated: ClassVar[float] = 4.0
     no_torque: ClassVar[str] = "its base was floating, and segments are too short"
@@ -208,6 +209,10 @@ def reconstruct(robot: Robot, log: Log) -> tuple[Log, BaseState]:
     LogError, ModelError
         If the base cannot be reconstructed.
     """
+    return log.once(("base", robot.fingerprint, robot.at), lambda: _reconstruct(robot, log))
+
+
+def _reconstruct(robot: Robot, log: Log) -> tuple[Log, BaseState]:
     robot = robot.for_log(log)
     model = compile_model(robot, log, robot.always, Numerics("RK4", FASTEST))
     index = make_index(model)

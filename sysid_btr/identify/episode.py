@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -83,10 +84,12 @@ class Procedure:
         model grow in a replay.
     fuses : whether `fuse` has more to say than the residuals.
     costly : whether each candidate is a simulation of its own, so that fewer are asked for.
+    on_ground : whether the ground of the model carries it, and shows.
     leaves_ground_error : whether the right model leaves an error that no effect explains: that of its ground.
     tolerated : chi2 of fitted data up to which the model counts as right: noise floors are read from logs.
     replayed : whether its commands are replayed at all.
     no_torque : why the missing torque cannot be characterised, where it cannot.
+    uncertain : what is not fitted and may be off, as in `Study.nuisance`.
     unseen : why a term that it does not show changes nothing, and the way out.
     """
 
@@ -102,11 +105,13 @@ class Procedure:
     wanders: ClassVar[bool] = False
     fuses: ClassVar[bool] = False
     costly: ClassVar[bool] = False
+    on_ground: ClassVar[bool] = False
     leaves_ground_error: ClassVar[bool] = False
     tolerated: ClassVar[float] = 1.5
     replayed: ClassVar[bool] = True
     no_torque: ClassVar[str] = "the replay fails or is too short"
     unseen: ClassVar[str] = ""
+    uncertain: Mapping[str, float] = MappingProxyType({})
 
     def shows(self, term: type[Term]) -> bool:
         """Whether a term of this class changes what is compared."""

@@ -289,11 +289,12 @@ class _Search:
         budget = budget.after(coarse.evaluations)
         problem, spent = study.train_problem(coarse.model), spent + coarse.evaluations
         believed = study.with_belief(problem)
+        suited = study.procedure.suited(estimator)
         if study.procedure.deferred:
             result = deferred_fit(
                 believed,
                 study.cheap,
-                study.procedure.suited(estimator),
+                suited,
                 step=study.stencil(model.terms),
                 rng=rng,
                 budget=budget,
@@ -301,7 +302,7 @@ class _Search:
                 progress=progress,
             )
         else:
-            result = estimator.fit(believed, rng=rng, budget=budget, journal=journal, progress=progress)
+            result = suited.fit(believed, rng=rng, budget=budget, journal=journal, progress=progress)
         return _Solved(study, problem, result, result.evaluations + spent, True)
 
 

@@ -22,11 +22,14 @@ from sysid_btr.models.commands import drives_nothing
 from sysid_btr.models.robot import Robot, joint_names
 
 GIVEN = "driven by the measured torques, with which the plain model moves more like the log than with those commanded"
+STANDS = "the plain model keeps standing as the robot does, and errors of its start die out"
+FALLS = "its base floats, and the plain model does not keep standing, as the robot must: no inertial unit is logged"
 AUTO, WHOLE = "auto", "whole"
 KINDS = {
     "forward": "sysid_btr.identify.episode:FixedEpisode",
     "segments": "sysid_btr.identify.segmented:SegmentedEpisode",
     "inverse": "sysid_btr.identify.inverse:InverseEpisode",
+    "standing": "sysid_btr.floating_base.standing:StandingEpisode",
     "floating": "sysid_btr.floating_base.episode:FloatingEpisode",
     "innovations": "sysid_btr.floating_base.innovations:InnovationsEpisode",
 }
@@ -126,7 +129,7 @@ def _resolved(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, st
 def _resolve(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str]:
     """The mode of one log, and why."""
     if log.meta.mount == "free":
-        return _of_floating(robot, log, mode)
+        return _of_floating(robot, log, mode, threads)
     if mode.asked != AUTO:
         return mode.asked, "as asked for"
     joints = joint_names(robot)
@@ -148,7 +151,7 @@ def _swinging(robot: Robot, log: Log, threads: int) -> tuple[str, ...]:
     return InverseEpisode.whole(robot, log, threads).swinging(threads)
 
 
-def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
+def _of_floating(robot: Robot, log: Log, mode: Mode, threads: int) -> tuple[str, str]:
     """The mode of a log whose base floats, and why."""
     suited = _kind("innovations").suits(robot, log)
     if mode.asked == "innovations" and not suited:
@@ -158,8 +161,12 @@ def _of_floating(robot: Robot, log: Log, mode: Mode) -> tuple[str, str]:
         )
     if mode.asked == "innovations":
         return "innovations", "as asked for"
+    if mode.asked == AUTO and suited:
+        return "innovations", "its base floats"
+    if mode.asked in (AUTO, "forward") and not log.joints("imu") and _kind("standing").suits(robot, log, threads):
+        return "standing", STANDS
     if mode.asked == AUTO:
-        return ("innovations", "its base floats") if suited else ("floating", "its base floats")
+        return "floating", "its base floats" if log.joints("imu") else FALLS
     if mode.asked == "forward" or (mode.asked == "segments" and not mode.seconds > 0):
         return "floating", "as asked for"
     raise UsageError(

@@ -30,7 +30,7 @@ USUAL = "mass"
 
 
 def error_of_the_rest(study: Study, model: Model, jacobian: FloatArray) -> FloatArray:
-    """Standard deviation (p,) of estimates by what is not fitted, as far as `Study.nuisance` lets it be off.
+    """Standard deviation (p,) of estimates by what is not fitted, as far as that may be off.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def error_of_the_rest(study: Study, model: Model, jacobian: FloatArray) -> Float
     UsageError
         If a name is of no parameter, or the estimates come from more than these residuals.
     """
-    if not study.nuisance:
+    if not _uncertain(study):
         return np.zeros(len(model.values))
     if study.procedure.fuses:
         raise UsageError(
@@ -67,14 +67,19 @@ def assumptions(study: Study, terms: Terms) -> dict[str, Any]:
     masses = [term for term in _parsed(study, USUAL) if not _declared(term, terms)]
     allowed = {place for term, _ in _undeclared(study, terms) if term.name == USUAL for place in term.places}
     return {
-        "nuisance": dict(study.nuisance),
+        "nuisance": dict(_uncertain(study)),
         "taken_as_exact": [f"{USUAL}:{p}" for term in masses for p in term.places if p not in allowed],
     }
 
 
+def _uncertain(study: Study) -> Mapping[str, float]:
+    """What may be off, with its standard deviation: what logs of this kind leave open, and what was stated."""
+    return {**study.procedure.uncertain, **study.nuisance}
+
+
 def _undeclared(study: Study, terms: Terms) -> Iterator[tuple[Term, float]]:
     """Terms that are not fitted, with the standard deviation of each of their numbers."""
-    for name, std in study.nuisance.items():
+    for name, std in _uncertain(study).items():
         yield from ((term, std) for term in _parsed(study, name) if not _declared(term, terms))
 
 
