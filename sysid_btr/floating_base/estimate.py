@@ -27,7 +27,7 @@ from sysid_btr.floating_base.feet import (
     points_in_base,
     touching_bodies,
 )
-from sysid_btr.floating_base.orientation import smooth_orientation
+from sysid_btr.floating_base.orientation import smooth_orientation, tilt_of
 from sysid_btr.floating_base.size import BodySize, measure_size
 from sysid_btr.identify.smoothing import Tracks, smooth, smooth_joints
 from sysid_btr.io.noise import noise_floor
@@ -105,7 +105,7 @@ class BaseState:
     @property
     def tilt(self) -> FloatArray:
         """(n,) angle between the base's and the world's vertical, rad."""
-        return np.arccos(np.clip(self.rotation[:, 2, 2], -1.0, 1.0))
+        return tilt_of(self.rotation)
 
     @property
     def quaternion(self) -> FloatArray:
@@ -162,7 +162,7 @@ def estimate_base(model: mujoco.MjModel, log: Log, joints: Sequence[str], addres
     contact = find_contacts(soles.bottom, load, size)
     force = _specific_force(model, log, rates, lost)
     position, velocity = _follow(time, rotation, force, contact, soles, size)
-    tilt = np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0))
+    tilt = tilt_of(rotation)
     events = _events(log.time, tilt, load, contact, soles, velocity, size)
     return BaseState(
         time=log.time,

@@ -20,6 +20,11 @@ def rotation_of(vector: FloatArray) -> FloatArray:
     return np.asarray(flat.reshape(*np.shape(vector)[:-1], 3, 3))
 
 
+def tilt_of(rotation: FloatArray) -> FloatArray:
+    """Angles (n,) between the base's vertical and the world's, rad, of rotations (n, 3, 3) of the base."""
+    return np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0))
+
+
 def smooth_orientation(
     time: FloatArray, gyro: FloatArray, up: FloatArray, gyro_std: float, up_std: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -15,7 +15,7 @@ from sysid_btr.floating_base.feet import touching_bodies, up_to_base
 from sysid_btr.floating_base.size import BodySize
 from sysid_btr.identify.initial_states import respond
 from sysid_btr.io.log import Log
-from sysid_btr.io.noise import channel_noise
+from sysid_btr.io.noise import position_noise
 from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.problem import Comparison
 from sysid_btr.objectives.targets import make_targets
@@ -152,9 +152,7 @@ def segment_numerics(
         runs = [replay.predict(np.zeros((1, 0))) for replay in replays]
         change = (runs[1].position - runs[0].position)[0]
         joints = replays[0].index.joints
-        sigma = np.array(
-            [channel_noise(log, f"position.{j}").sigma if log.has("position", j) else np.inf for j in joints]
-        )
+        sigma = position_noise(log, joints)
         each = [float(np.sqrt(np.mean((change[a:b] / sigma) ** 2))) for a, b in few.rows]
         error = float(np.median(each))
         if error <= TOLERATED:

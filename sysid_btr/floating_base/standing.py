@@ -17,12 +17,13 @@ from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.floating_base.episode import reconstruct
 from sysid_btr.floating_base.estimate import BaseState
 from sysid_btr.floating_base.events import find_fall
+from sysid_btr.floating_base.orientation import tilt_of
 from sysid_btr.floating_base.segments import FASTEST, whole_step
 from sysid_btr.identify.episode import ROUGH_STEP, E, FixedEpisode, Procedure
 from sysid_btr.identify.horizon import is_held
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
-from sysid_btr.io.noise import channel_noise
+from sysid_btr.io.noise import position_noise
 from sysid_btr.io.split import holdout_split
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import to_rotation
@@ -52,26 +53,26 @@ SOFTER = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Footing:
+class GroundSensitivity:
     """What the ground does to the joints of a robot that stands, as far as it is not known.
 
     Attributes
     ----------
-    firm : (n, j) samples and joints at which it matters about as much as it usually does.
-    give : (j,) rad, root mean square over these of what another softness does.
+    steady : (n, j) samples and joints at which it matters about as much as it usually does.
+    softness : (j,) rad, root mean square over these of what another softness does.
     """
 
-    firm: BoolArray
-    give: FloatArray
+    steady: BoolArray
+    softness: FloatArray
 
-    def allowed(self, target: Target) -> Target:
+    def discounted(self, target: Target) -> Target:
         """A target without the other samples, whose floors of positions hold for what the ground does."""
         n, columns = len(target.mask), target.columns
         mask = target.mask.copy()
-        mask[: len(self.firm)] &= self.firm[:n, columns]
+        mask[: len(self.steady)] &= self.steady[:n, columns]
         if target.channel != "position":
             return replace(target, mask=mask)
-        sigma = np.hypot(target.noise, self.give[columns])
+        sigma = np.hypot(target.noise, self.softness[columns])
         floor = tuple(replace(f, sigma=float(s)) for f, s in zip(target.floor, sigma, strict=True))
         return replace(target, mask=mask, floor=floor, sigma=target.sigma * (sigma / target.noise))
 
@@ -106,11 +107,11 @@ class StandingEpisode(FixedEpisode):
     Attributes
     ----------
     base : reconstructed motion of the base, sample by sample of `recording`.
-    footing : what the ground does to the joints, once known.
+    ground : what the ground does to the joints, once known.
     """
 
     base: BaseState = field(kw_only=True)
-    footing: Footing | None = None
+    ground: GroundSensitivity | None = None
 
     @property
     def procedure(self) -> Procedure:
@@ -150,26 +151,27 @@ class StandingEpisode(FixedEpisode):
         return replace(super().replay(terms, numerics, effort=effort, threads=threads), base_start=self.base_start)
 
     def completed(self, plain: Comparison) -> Comparison:
-        if self.footing is None:
+        if self.ground is None:
             return plain
-        return replace(plain, targets=tuple(map(self.footing.allowed, plain.targets)))
+        return replace(plain, targets=tuple(map(self.ground.discounted, plain.targets)))
 
     def with_initial_states(
         self, compare: Callable[[], Comparison], values: FloatArray, coarse: Numerics, *, anew: bool = True
     ) -> StandingEpisode:
-        found = super().with_initial_states(compare, values, coarse, anew=anew)
+        comparison = compare()
+        found = super().with_initial_states(lambda: comparison, values, coarse, anew=anew)
         assert isinstance(found, StandingEpisode)
-        if found.footing is not None and not anew:
+        if found.ground is not None and not anew:
             return found
-        replay = replace(compare().replay, begun=found.begun, effort=False)
-        known = footing(replay, values)
-        return found if known is None else replace(found, footing=known)
+        replay = replace(comparison.replay, begun=found.begun, effort=False)
+        known = ground_sensitivity(replay, values)
+        return found if known is None else replace(found, ground=known)
 
     def choose_numerics(self, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
         return choose_numerics(self.robot, self.log, threads, simulator, self.base_start)
 
     def facts(self) -> Mapping[str, Any]:
-        rocking = 0.0 if self.footing is None else float(np.mean(~self.footing.firm))
+        rocking = 0.0 if self.ground is None else float(np.mean(~self.ground.steady))
         more = f"; {rocking:.0%} of all positions, while it rocks on its soles, do not count" if rocking >= 0.01 else ""
         return {
             "mode": "forward",
@@ -181,7 +183,7 @@ class StandingEpisode(FixedEpisode):
         }
 
 
-def footing(replay: Replay, values: FloatArray) -> Footing | None:
+def ground_sensitivity(replay: Replay, values: FloatArray) -> GroundSensitivity | None:
     """What the ground does to the joints; None where the replay fails.
 
     On the edges of its soles a robot is an upside-down pendulum, and whatever little the model has wrong of the ground
@@ -191,16 +193,16 @@ def footing(replay: Replay, values: FloatArray) -> Footing | None:
     ----------
     replay, values : of a robot that stands, and the candidate (p,).
     """
-    ground = replace(replay, terms=(*replay.terms, GravityTilt(EVERYWHERE), FootCompliance(EVERYWHERE)))
+    varied = replace(replay, terms=(*replay.terms, GravityTilt(EVERYWHERE), FootCompliance(EVERYWHERE)))
     changes = [(0, 0, 1), (SLOPE, 0, 1), (-SLOPE, 0, 1), (0, SLOPE, 1), (0, -SLOPE, 1), (0, 0, SOFTER)]
     with silenced():
-        seen = ground.predict(np.column_stack([np.tile(values, (len(changes), 1)), changes])).position
+        seen = varied.predict(np.column_stack([np.tile(values, (len(changes), 1)), changes])).position
     if not np.isfinite(seen).all():
         return None
     seen = seen[1:] - seen[0]
-    moved = np.sqrt(np.mean(seen[:-1] ** 2, axis=0)) / _noise(replay.log, replay.index.joints)
-    firm = moved <= np.maximum(USUAL * np.median(moved, axis=0), SHOWS)
-    return Footing(firm, np.sqrt(np.mean(seen[-1] ** 2, axis=0, where=firm)))
+    moved = np.sqrt(np.mean(seen[:-1] ** 2, axis=0)) / position_noise(replay.log, replay.index.joints)
+    steady = moved <= np.maximum(USUAL * np.median(moved, axis=0), SHOWS)
+    return GroundSensitivity(steady, np.sqrt(np.mean(seen[-1] ** 2, axis=0, where=steady)))
 
 
 def _begin(robot: Robot, log: Log, base: BaseState) -> BaseStates:
@@ -240,12 +242,7 @@ def _stands(robot: Robot, log: Log, threads: int) -> bool:
         )
     if here.base is None or not (np.isfinite(here.position).all() and np.isfinite(there.position).all()):
         return False
-    tilt = np.arccos(np.clip(to_rotation(here.base[0, :, 3:7]).as_matrix()[:, 2, 2], -1.0, 1.0))
-    apart = (there.position - here.position)[0, len(log) // 2 :] / _noise(log, base.joints)
+    tilt = tilt_of(to_rotation(here.base[0, :, 3:7]).as_matrix())
+    apart = (there.position - here.position)[0, len(log) // 2 :] / position_noise(log, base.joints)
     forgotten = np.sqrt(np.mean(apart**2, axis=0)) < 1.0
     return bool(forgotten.all()) and find_fall(log.time, tilt) is None
-
-
-def _noise(log: Log, joints: Sequence[str]) -> FloatArray:
-    """(j,) noise floors of positions, infinite where the log has none."""
-    return np.array([channel_noise(log, f"position.{j}").sigma if log.has("position", j) else np.inf for j in joints])

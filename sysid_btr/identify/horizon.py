@@ -18,7 +18,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.identify.numerics import largest_step
 from sysid_btr.io.log import Log
-from sysid_btr.io.noise import channel_noise
+from sysid_btr.io.noise import position_noise
 from sysid_btr.models.robot import Robot, joint_names, servo_joints
 from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.simulation.silence import silenced
@@ -56,7 +56,7 @@ def linear_seconds(robot: Robot, log: Log, segments: Segments, threads: int = 0)
     whole = SegmentReplay(robot.for_log(log), log, tuple(terms), largest_step(log), threads=threads, segments=segments)
     names = whole.index.joints
     joints = [i for i, j in enumerate(names) if log.has("position", j)]
-    sigma = np.array([channel_noise(log, f"position.{names[i]}").sigma for i in joints])
+    sigma = position_noise(log, [names[i] for i in joints])
     measured = log.array("position", [names[i] for i in joints])
     nominal, step = terms.nominal, np.diag(terms.scale)
     candidates = np.concatenate([nominal[None], nominal + step, nominal - step])

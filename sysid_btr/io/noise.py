@@ -11,6 +11,7 @@ it is below what any converter resolves, that of a good sensor is assumed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb, sqrt
 from typing import Literal
@@ -48,6 +49,11 @@ def channel_noise(log: Log, column: str) -> NoiseFloor:
     """Noise of a log's column: as the log's metadata state it, else from its values."""
     stated, values = log.meta.stated_noise(column), log.channels[column]
     return noise_floor(values) if stated is None else NoiseFloor(float(stated), "stated", quantisation_step(values))
+
+
+def position_noise(log: Log, joints: Sequence[str]) -> FloatArray:
+    """(j,) noise floors of the positions of joints, infinite where the log has none."""
+    return np.array([channel_noise(log, f"position.{j}").sigma if log.has("position", j) else np.inf for j in joints])
 
 
 def noise_floor(values: FloatArray) -> NoiseFloor:
