@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import mujoco
@@ -33,24 +35,30 @@ from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.terms.model import Model, Terms
 
 
-def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(4)
-    n, joints, feet = 5, 2, 1
+def random_chain(rng: np.random.Generator, linked: Sequence[bool]) -> tuple[Chain, Derivatives]:
+    """A chain of two joints and a foot, and steps that are linear."""
+    joints, feet = 2, 1
+    w, n = len(linked), len(linked) + 1
     states = random_states(n, joints, rng)
-    d, w = states.std.shape[1], n - 1
-    linked = np.array([True, True, False, True])
+    d = states.std.shape[1]
     chain = Chain(
-        steps=cast(Any, None),
+        steps=cast(Any, SimpleNamespace(wrench=np.zeros((w, feet, 6)))),
         states=states,
         touch=np.ones((w, feet), dtype=bool),
-        linked=linked,
+        linked=np.array(linked),
         measured=rng.normal(size=(n, joints + 5)),
         sigma=np.where(rng.random((n, joints + 5)) < 0.2, np.inf, 0.5),
         time=np.arange(n) * 0.02,
         size=replace(NAO, weight=0.01),
     )
     shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3, (w, d, joints)]
-    known = Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
+    return chain, Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
+
+
+def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    chain, known = random_chain(np.random.default_rng(4), [True, True, False, True])
+    states, linked = chain.states, chain.linked
+    (n, joints), (w, d) = states.joint_position.shape, known.start.shape[:2]
     keep = np.setdiff1d(np.arange(d), chain_module.BLIND)
     sight = chain_module.measurements(chain)[0]
     total = chain_module.unexplained(chain, known)[2][:, keep][:, :, keep]
@@ -66,8 +74,11 @@ def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.Monk
             elif k < w:
                 error = prior * start[1]
         monkeypatch.setattr(innovations, "measurements", lambda _: (sight, np.array(seen)))
-        own = kalman_filter(chain, known, np.zeros((w, d)))
-        return own.innovations(np.zeros((1, w, len(keep)))).ravel()
+        own = kalman_filter(chain, known, *np.zeros((2, w, d)))
+        # what steps that are linear miss of the states, from where they begin and under the forces they have
+        moved_by, force = chain_module.difference(own.filtered, states)[:-1], own.wrench.reshape(w, -1)
+        missed = np.einsum("kij,kj->ki", known.start, moved_by) + np.einsum("kij,kj->ki", known.mean, force)
+        return own.innovations(np.where(linked[:, None], missed[:, keep], 0.0)[None]).ravel()
 
     sizes = [(2, len(keep)), (w, len(keep)), (n, joints + 5)]
     count = sum(a * b for a, b in sizes)
@@ -77,6 +88,28 @@ def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.Monk
         columns.append(shown(*(part.reshape(size) for part, size in zip(parts, sizes, strict=True))))
     by_noise = np.column_stack(columns)
     np.testing.assert_allclose(by_noise @ by_noise.T, np.eye(n * joints), atol=1e-7)
+
+
+def test_a_sample_is_predicted_from_what_was_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The states about which a filter is linearised know later samples; from where it predicts must not show them."""
+    rng = np.random.default_rng(5)
+    chain, known = random_chain(rng, [True] * 6)
+    sight, left = chain_module.measurements(chain)
+    (w, d), defect = known.start.shape[:2], 0.01 * rng.normal(size=known.start.shape[:2])
+    other = np.concatenate([np.zeros((1, d)), 0.1 * rng.normal(size=(w, d))])
+    other[:, list(chain_module.BLIND)] = 0.0
+
+    def found(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Filtered states and forces of the same samples, linearised about other states."""
+        seen = left + np.einsum("kmd,kd->km", sight, states)
+        missed = defect + np.einsum("kij,kj->ki", known.start, states[:-1]) - states[1:]
+        monkeypatch.setattr(innovations, "measurements", lambda _: (sight, seen))
+        own = kalman_filter(chain, known, missed, np.zeros((w, d)))
+        return chain_module.difference(own.filtered, chain.states) + states, own.wrench
+
+    for one, same in zip(found(np.zeros((w + 1, d))), found(other), strict=True):
+        np.testing.assert_allclose(one, same, atol=1e-9)
+    assert np.abs(found(other)[1]).max() > 1e-4  # forces that nobody knew are found
 
 
 @cache

@@ -73,14 +73,25 @@ SETTLING = 0.3
 
 @dataclass(frozen=True)
 class Foreseen(SampleSteps):
-    """Each sample as it is predicted from the state at the one before; the first is where the chain begins."""
+    """Each sample as it is predicted from the state at the one before; the first is where the chain begins.
+
+    Attributes
+    ----------
+    filtered : states from which the next samples are predicted, where they are not those of `segments`.
+    """
+
+    filtered: Segments | None = None
+
+    @property
+    def starts(self) -> Segments:
+        return self._segments if self.filtered is None else self.filtered
 
     def _run(self, candidates: FloatArray) -> Outputs:
         m, w, j = len(candidates), len(self._segments), len(self.index.joints)
         row, segment = np.tile(np.arange(m), w), np.repeat(np.arange(w), m)
         position, velocity = np.empty((m, w + 1, j)), np.empty((m, w + 1, j))
         base, effort = np.empty((m, w + 1, 13)), np.empty((m, w + 1, j))
-        starts, free = self._segments, self._segments.free_base
+        starts, free = self.starts, self.starts.free_base
         position[:, 0], velocity[:, 0] = starts.joint_position[0], starts.joint_velocity[0]
         base[:, 0] = np.concatenate([free.position[0], free.quaternion[0], free.velocity[0], free.rate[0]])
         for sims, part in self._simulate(candidates, row, segment, None):
@@ -99,7 +110,9 @@ class Filter:
 
     Attributes
     ----------
-    states : (n) about which it is linearised.
+    states : (n) about which it is linearised: what all samples leave most probable.
+    filtered : (n) what each sample and those before it leave most probable, from which the next one is predicted.
+    wrench : (n - 1, f, 6) mean forces on the feet of which the same is true, with the sample at their end.
     linked : (n - 1,) steps that are replayed; after another one it begins anew.
     carry, push : (n - 1, d, d), (n - 1, d) error of the state that is expected of the next sample, from that of this
         one, and from what this one measures.
@@ -109,6 +122,8 @@ class Filter:
     """
 
     states: Segments
+    filtered: Segments
+    wrench: FloatArray
     linked: BoolArray
     carry: FloatArray
     push: FloatArray
@@ -122,6 +137,8 @@ class Filter:
         samples, between = slice(start, stop), slice(start, stop - 1)
         return Filter(
             self.states.chosen(np.arange(start, stop)),
+            self.filtered.chosen(np.arange(start, stop)),
+            self.wrench[between],
             self.linked[between],
             self.carry[between],
             self.push[between],
@@ -175,8 +192,12 @@ def _without_base(array: FloatArray) -> FloatArray:
     return np.asarray(np.delete(array, BLIND, axis=-1))
 
 
-def kalman_filter(chain: Chain, known: Derivatives, late: FloatArray) -> Filter:
+def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: FloatArray) -> Filter:
     """The filter of a chain.
+
+    A sample is predicted from a state and forces that know nothing of later ones. The chain's own have the noise of
+    these in them: what a gain makes of a velocity would go with the very noise it is compared with, and all gains
+    and masses come out too small (errors in variables).
 
     Innovations of the inertial unit come first: unknown forces on the feet show in it. Those of the joints are what
     it leaves of them, whitened by the symmetric root of their covariance, so that each stays that of its joint.
@@ -184,22 +205,26 @@ def kalman_filter(chain: Chain, known: Derivatives, late: FloatArray) -> Filter:
     Parameters
     ----------
     chain, known : walk, and derivatives of its steps.
+    defect : (n - 1, d) by how much its steps miss the next state.
     late : (n - 1, d) derivative of the ends of steps by the time that commands come later.
     """
-    n, j = chain.states.joint_position.shape
+    (n, j), count = chain.states.joint_position.shape, known.mean.shape[2]
     sizes, forces, unknown = unexplained(chain, known)
     noise = _without_base(np.delete(unknown, BLIND, axis=1))
     # what is as good as free: mean forces on the feet, which come first, and what joints hold, which comes last
-    mean, beside = forces[:, :, : known.mean.shape[2]], forces[:, :, len(sizes) :]
-    steady = np.delete(np.concatenate([mean, beside], axis=2), BLIND, axis=1)
+    mean, beside = (np.delete(part, BLIND, axis=1) for part in np.split(forces, [count, len(sizes)], axis=2)[::2])
+    steady = np.concatenate([mean, beside], axis=2)
     start = _without_base(np.delete(known.start, BLIND, axis=1))
     sight, left = measurements(chain)
     sight = _without_base(sight)
     d = sight.shape[2]
     prior = np.diag(_without_base(each_of(LOOSE, chain)) ** 2)
+    linked = chain.linked[:, None]
+    late, defect = (np.where(linked, _without_base(part), 0.0) for part in (late, defect))
     carry, push = np.zeros((n - 1, d, d)), np.zeros((n - 1, d))
+    moved, pushed = np.zeros((n, d)), np.zeros((n - 1, count))
     white_sight, white_seen, share = np.zeros((n, j, d)), np.zeros((n, j)), np.ones((n, j))
-    cov = prior
+    cov, error = prior, np.zeros(d)
     for k in range(n):
         own = sight[k]
         total = own @ cov @ own.T + np.eye(len(own))
@@ -210,19 +235,28 @@ def kalman_filter(chain: Chain, known: Derivatives, late: FloatArray) -> Filter:
         white_sight[k], white_seen[k] = whiten @ own, -whiten @ left[k]
         if k and chain.linked[k - 1]:
             share[k] -= np.sum((white_sight[k] @ steady[k - 1]) ** 2, axis=1)
+            pushed[k - 1] = -mean[k - 1].T @ own.T @ np.linalg.solve(total, left[k] + own @ error)
+            push[k - 1] -= mean[k - 1] @ pushed[k - 1]
+        keep = np.eye(d) - gain @ own
+        moved[k] = keep @ error - gain @ left[k]
         if k == n - 1:
             break
         if not chain.linked[k]:
-            cov = prior
+            cov, error = prior, np.zeros(d)
             continue
-        keep = np.eye(d) - gain @ own
-        carry[k], push[k] = start[k] @ keep, -start[k] @ gain @ left[k]
+        # predictions begin where the states have moved to
+        carry[k], push[k] = start[k] @ keep, -start[k] @ (gain @ left[k] + moved[k])
+        error = start[k] @ moved[k] + defect[k]
         # Joseph's form: what is subtracted is nearly all there is
         cov = keep @ cov @ keep.T + gain @ gain.T
         cov = start[k] @ cov @ start[k].T + noise[k]
         cov = 0.5 * (cov + cov.T)
-    late = np.where(chain.linked[:, None], _without_base(late), 0.0)
-    return Filter(chain.states, chain.linked, carry, push, white_sight, white_seen, share, late)
+    whole = np.zeros((n, d + len(BLIND)))
+    whole[:, np.delete(np.arange(d + len(BLIND)), BLIND)] = moved
+    assert chain.steps.wrench is not None
+    wrench = chain.steps.wrench + (sizes[:count] * pushed).reshape(chain.steps.wrench.shape)
+    filtered = chain.states.moved(whole)
+    return Filter(chain.states, filtered, wrench, chain.linked, carry, push, white_sight, white_seen, share, late)
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,6 +392,7 @@ class InnovationsEpisode(Episode):
         if self.chain is None:
             return FloatingReplay(robot, log, tuple(terms), numerics, effort, threads, base=base)
         steps = self.chain.part(0, n).steps
+        own = None if self.filter is None else self.filter.part(0, n)
         return Foreseen(
             robot,
             log,
@@ -367,8 +402,9 @@ class InnovationsEpisode(Episode):
             threads,
             segments=steps.segments,
             base=base,
-            wrench=steps.wrench,
+            wrench=steps.wrench if own is None else own.wrench,
             friction=steps.friction,
+            filtered=None if own is None else own.filtered.chosen(np.arange(n - 1)),
         )
 
     def completed(self, plain: Comparison) -> Comparison:
@@ -497,4 +533,4 @@ def filter_at(chain: Chain, known: Derivatives, values: FloatArray) -> Filter:
     """The filter of a chain about its states under a candidate."""
     ends = simulate_chain(chain, values, np.arange(0), np.zeros(0))
     # the right model errs by no more than the least slack
-    return kalman_filter(replace(chain, slack=1.0), known, ends.by_number[:, :, -1])
+    return kalman_filter(replace(chain, slack=1.0), known, ends.defect, ends.by_number[:, :, -1])

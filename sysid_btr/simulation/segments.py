@@ -178,6 +178,11 @@ class SegmentReplay(Replay):
             raise ValueError("a segmented replay needs segments")
         return self.segments
 
+    @property
+    def starts(self) -> Segments:
+        """States from which segments are simulated."""
+        return self._segments
+
     @cached_property
     def _frames(self) -> list[_Frame]:
         grid = self.grid
@@ -305,7 +310,7 @@ class SegmentReplay(Replay):
     def _setup(self, pairs: Values, segment: IntArray, change: FloatArray | None, steps: int) -> Setup:
         """Segments from their initial states, with `change` added to these."""
         h = self.grid.timestep
-        starts = self._segments.chosen(segment)
+        starts = self.starts.chosen(segment)
         if change is not None:
             starts = starts.moved(change[:, : starts.std.shape[1]])
         first, late = (np.array([getattr(frame, n) for frame in self._frames])[segment] for n in ("first", "late"))
