@@ -78,12 +78,12 @@ def test_a_mass_a_gain_and_a_delay_are_learnt_on_a_ground_that_is_not_the_models
     assert first.before > 2 > 1.5 > max(first.after, second.before)
     for learnt in (first, second):
         assert learnt.explained
-        assert np.all(np.abs(learnt.belief.mean - TRUTH) < 4 * learnt.belief.std)
+        assert np.all(np.abs(learnt.belief.mean - TRUTH) < 3 * learnt.belief.std)
         # the truth is among what is believed, and the model's own numbers are not
         assert far_from(TRUTH, learnt.belief) < chi2.ppf(0.999, len(TRUTH)) < far_from(TERMS.nominal, learnt.belief)
     # every trial adds to what is known; joints may rub, which leaves the torso's mass the least of all
     assert np.all(second.belief.std < first.belief.std)
-    assert np.all(second.belief.std < [0.7, 0.5, 0.1, 0.1] * before().std)
+    assert np.all(second.belief.std < [0.75, 0.5, 0.1, 0.1] * before().std)
     differs = TERMS.nominal != TRUTH
     assert np.all(np.abs(second.belief.mean - TRUTH)[differs] < 0.5 * np.abs(TERMS.nominal - TRUTH)[differs])
 
