@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 
 from sysid_btr.estimators import Budget, GeneticAlgorithm, Journal, silent
-from sysid_btr.estimators.lsq import LeastSquares, linearise
+from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.io.log import Log, LogMeta
