@@ -18,7 +18,7 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.floating_base.attitude import NEAR
 from sysid_btr.floating_base.estimate import BaseState, foot_loads, lowest_points
-from sysid_btr.floating_base.feet import touching_bodies
+from sysid_btr.floating_base.feet import Foot, points_in_base, touching_bodies
 from sysid_btr.floating_base.segments import FloatingReplay, starts_at, whole_step
 from sysid_btr.floating_base.size import BodySize
 from sysid_btr.io.log import Log
@@ -46,9 +46,12 @@ ROUGH, ROUGH_ERROR, CHECKED = 0.010, 0.05, 16
 samples."""
 BLIND = (0, 1, 2, 6, 7, 8)
 """Of a state: position and velocity of the base, on which without contact nothing else depends."""
-STEADY, LEVER = 20.0, 0.07
-"""Standard deviation of the mean force on a foot over a sample, in weights of the robot: as good as free. Times the
-lever (m) it is that of the torque."""
+STEADY = 20.0
+"""Standard deviation of the mean force on a foot over a sample, in weights of the robot: as good as free."""
+STEADY_KINDS = (STEADY, STEADY, STEADY, 1.0, 1.0, 1.0)
+LOW, BESIDE = 0.005, 0.01
+"""m, height above a foot's lowest point within which others of its points press on the ground too, and standard
+deviation of where the force acts beside the middle of these and their own spread: soles give, feet roll."""
 JOLTS = (0.0001, 0.0003, 0.001, 0.003, 0.009)
 """The same of what the force does beside its mean, at either end of a sample, in weights times seconds: the likeliest
 of these, as a loose one lets noise pass for motion."""
@@ -207,6 +210,8 @@ class Chain:
     time : (n,) s since the first sample.
     size : of the robot.
     jolt, slack : one of `JOLTS`, and factor on `SLACK`, one of `SLACKS`.
+    reach : (n - 1, f, 6, 6) force and torque on a foot's centre of mass by a force in the middle of where it may touch,
+        of one weight, and by the torque that this has as the ground may press beside that: standard deviations.
     held : (j,) size, Nms, of the unknown blow in a step in which a joint may stand still; None where nothing rubs.
     """
 
@@ -218,6 +223,7 @@ class Chain:
     sigma: FloatArray
     time: FloatArray
     size: BodySize
+    reach: FloatArray
     jolt: float = JOLTS[2]
     slack: float = 1.0
     held: FloatArray | None = None
@@ -244,6 +250,7 @@ class Chain:
             measured=self.measured[samples],
             sigma=self.sigma[samples],
             time=self.time[samples] - self.time[start],
+            reach=self.reach[between],
         )
 
 
@@ -334,8 +341,10 @@ def chain_of(replay: FloatingReplay) -> Chain:
     near = _touching(steps.model, walk, base)
     touch = near[:-1] | near[1:]
     share = touch / np.maximum(touch.sum(axis=1, keepdims=True), 1)
-    wrench = np.zeros((n - 1, touch.shape[1], 6))
-    wrench[:, :, 2] = base.size.weight * share
+    reach = _reach(steps.model, base)
+    force = np.zeros((n - 1, touch.shape[1], 6))
+    force[:, :, 2] = share
+    wrench = np.einsum("wfij,wfj->wfi", reach, force)
     attitude = base.attitude
     joints = [walk.channels[f"position.{j}"] if walk.has("position", j) else np.full(n, np.nan) for j in base.joints]
     measured = np.column_stack([*joints, attitude.turning, attitude.up[:, :2]])
@@ -353,7 +362,31 @@ def chain_of(replay: FloatingReplay) -> Chain:
         sigma=sigma,
         time=walk.time - walk.time[0],
         size=base.size,
+        reach=reach,
     )
+
+
+def _reach(model: mujoco.MjModel, base: BaseState) -> FloatArray:
+    """`Chain.reach` of the steps between samples."""
+    feet = touching_bodies(model)
+    addresses = np.array([model.jnt_qposadr[model.joint(j).id] for j in base.joints], dtype=np.int64)
+    size, rotation = base.size, base.rotation
+    centres = [Foot(f.name, model.body(f.name).ipos[None], np.zeros(1)) for f in feet]
+    middles = points_in_base(model, centres, addresses, base.joint_position)
+    result = np.zeros((len(rotation), len(feet), 6, 6))
+    for k, (foot, points) in enumerate(zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True)):
+        arm = np.einsum("nij,nkj->nki", rotation, points - middles[k])
+        arm[:, :, 2] -= foot.radius
+        above = arm[:, :, 2] - arm[:, :, 2].min(axis=1, keepdims=True)
+        share = np.exp(-0.5 * (above / size.length(LOW)) ** 2)
+        share /= share.sum(axis=1, keepdims=True)
+        middle = np.einsum("nk,nki->ni", share, arm)
+        spread = np.einsum("nk,nki->n", share, (arm - middle[:, None]) ** 2)
+        result[:, k, [0, 1, 2], [0, 1, 2]] = 1.0
+        for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
+            result[:, k, 3 + i, b], result[:, k, 3 + i, a] = middle[:, a], -middle[:, b]
+            result[:, k, 3 + i, 3 + i] = np.sqrt(spread + size.length(BESIDE) ** 2)
+    return size.weight * 0.5 * (result[:-1] + result[1:])
 
 
 def _touching(model: mujoco.MjModel, walk: Log, base: BaseState) -> BoolArray:
@@ -594,14 +627,28 @@ def unexplained(chain: Chain, known: Derivatives) -> tuple[FloatArray, FloatArra
 
     What joints hold that may stand still comes after the forces, (w, d, 18 f + j).
     """
-    size = chain.size
-    kinds = np.tile([1.0] * 3 + [size.length(LEVER)] * 3, chain.touch.shape[1])
-    jolt = size.time(chain.jolt) * kinds
-    sizes = np.concatenate([STEADY * kinds, jolt, jolt]) * size.weight
-    forces = np.concatenate([known.mean, known.blow, known.last], axis=2) * sizes
+    count = chain.reach[0, :, 0].size
+    jolt = chain.size.time(chain.jolt)
+    kinds = np.tile(STEADY_KINDS, count // 6)
+    sizes = np.concatenate([kinds, np.full(2 * count, jolt)])
+    parts = (known.mean, known.blow, known.last)
+    forces = np.concatenate([_at_contact(chain, part) for part in parts], axis=2) * sizes
     if chain.held is not None:
         forces = np.concatenate([forces, known.joint * (chain.held * chain.steps.still)[:, None]], axis=2)
     return sizes, forces, forces @ forces.transpose(0, 2, 1) + np.diag((chain.slack * each_of(SLACK, chain)) ** 2)
+
+
+def _at_contact(chain: Chain, part: FloatArray) -> FloatArray:
+    """(w, d, 6 f) what forces and torques do where feet touch, in the units of `Chain.reach`."""
+    w, d, _ = part.shape
+    feet = part.reshape(w, d, -1, 6).transpose(0, 2, 1, 3)
+    return np.asarray((feet @ chain.reach).transpose(0, 2, 1, 3).reshape(part.shape))
+
+
+def acting(chain: Chain, pushed: FloatArray) -> FloatArray:
+    """(w, f, 6) forces and torques on the feet of (w, 6 f) unknown ones of the size of their own."""
+    w, f = chain.touch.shape
+    return np.asarray(np.einsum("wfij,wfj->wfi", chain.reach, pushed.reshape(w, f, 6) * STEADY_KINDS))
 
 
 def each_of(kinds: Sequence[float], chain: Chain) -> FloatArray:
@@ -647,11 +694,13 @@ def moved_chain(chain: Chain, known: Derivatives, found: Round, change: FloatArr
     linked = chain.linked[:, None, None]
     forces, total = np.where(linked, forces, 0.0), np.where(linked, total, np.eye(d))
     rest = np.where(linked[:, :, 0], rest, 0.0)
-    own = forces[:, :, : len(sizes)]
-    pushed = -np.einsum("ndm,nd->nm", own, np.linalg.solve(total, rest[:, :, None])[:, :, 0]) * sizes
+    own = forces[:, :, : chain.reach[0, :, 0].size]
+    pushed = -np.einsum("ndm,nd->nm", own, np.linalg.solve(total, rest[:, :, None])[:, :, 0])
     wrench = chain.steps.wrench
     assert wrench is not None
-    mean = pushed[:, : wrench[0].size].reshape(wrench.shape)
+    # torques beside the middle of a contact stay what is not known
+    pushed = pushed.reshape(*wrench.shape) * [1, 1, 1, 0, 0, 0]
+    mean = acting(chain, pushed)
     states = chain.states.moved(move)
     steps = replace(chain.steps, segments=states.chosen(np.arange(n - 1)), wrench=wrench + mean)
     return replace(chain, steps=steps, states=states)

@@ -30,6 +30,7 @@ from sysid_btr.floating_base.chain import (
     Chain,
     Derivatives,
     SampleSteps,
+    acting,
     chain_of,
     chainable,
     derive,
@@ -254,7 +255,7 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
     whole = np.zeros((n, d + len(BLIND)))
     whole[:, np.delete(np.arange(d + len(BLIND)), BLIND)] = moved
     assert chain.steps.wrench is not None
-    wrench = chain.steps.wrench + (sizes[:count] * pushed).reshape(chain.steps.wrench.shape)
+    wrench = chain.steps.wrench + acting(chain, pushed)
     filtered = chain.states.moved(whole)
     return Filter(chain.states, filtered, wrench, chain.linked, carry, push, white_sight, white_seen, share, late)
 
