@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sysid_btr._typing import FloatArray
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.robot import Trial
 from sysid_btr.errors import LogError, ModelError, UsageError
@@ -33,9 +34,9 @@ from sysid_btr.terms.model import Model, Terms
 SECONDS, LOGS = 4.0, 2
 """s from its beginning of a trial that is learnt from, and trials of an iteration: more cost more time than the search
 for gaits."""
-TURNS, SETTLED = 4, 0.05
-"""Times that states and numbers are found in turn, at most; and the change of what is left, as a fraction, below which
-another would move numbers by less than a tenth of their deviation."""
+TURNS, SETTLED = 6, 0.25
+"""Times that states and numbers are found in turn, at most, and standard deviations by which the last one moves these.
+"""
 
 
 def model_fit() -> LeastSquares:
@@ -107,7 +108,7 @@ def learn(
     model, spent = Model.of(shown, own.mean), 0
     if not np.array_equal(model.values, model.terms.nominal):
         study = study.with_initial_states(model)  # those of a study are the plain model's
-    first = last = _judged(study, model)
+    first = _judged(study, model)
     study = inflate(study, first, memory=True)
     reached: list[tuple[Study, Fitted]] = []
     for _ in range(TURNS):
@@ -115,22 +116,28 @@ def learn(
         result = estimator.fit(problem, rng=rng, budget=Budget(), journal=Journal(), progress=progress)
         if result.termination is Termination.INTERRUPTED:
             raise KeyboardInterrupt
+        moved = np.abs(result.x - model.values)
         model, spent = model.at(result.x), spent + result.evaluations
+        std = np.sqrt(np.diag(_covariance(problem, model)))
         study = study.with_initial_states(model)
         found = _judged(study, model)
         study = inflate(study, found, memory=True)
         reached.append((study, found))
-        if abs(found.train / last.train - 1) < SETTLED:
+        if np.all(moved <= SETTLED * std):
             break
-        last = found
     study, found = min(reached, key=lambda pair: pair[1].train if np.isfinite(pair[1].train) else np.inf)
     model, explained = found.model, found.train <= study.procedure.tolerated
     if explained:
         problem = MapProblem(study.train_problem(model), own)
-        jacobian = linearise(problem, model.values)[1]
         # the logs' noise is inflated by what is left of them, and by how long that remembers
-        belief = belief.after(rows, model.values, np.asarray(np.linalg.inv(jacobian.T @ jacobian)))
+        belief = belief.after(rows, model.values, _covariance(problem, model))
     return Learnt(belief, first.train, found.train, explained, spent)
+
+
+def _covariance(problem: MapProblem, model: Model) -> FloatArray:
+    """(p, p) of the numbers of a model by what logs and belief say."""
+    jacobian = linearise(problem, model.values)[1]
+    return np.asarray(np.linalg.inv(jacobian.T @ jacobian))
 
 
 def _judged(study: Study, model: Model) -> Fitted:

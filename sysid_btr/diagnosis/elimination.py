@@ -26,14 +26,16 @@ from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt, is_wanted
 from sysid_btr.diagnosis.uncertainty import with_intervals
 from sysid_btr.estimators.base import Progress, without_loss
+from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.refit import Fitted, inflate, refit, shorten
 from sysid_btr.identify.study import Study
+from sysid_btr.objectives.covariance import spread
 from sysid_btr.terms.effect import Effect
 
 Wanted = Callable[[Selection, Fitted, Fitted], bool]
 """Whether data want what the first model lacks of the second."""
-SETTLED = 0.01
-"""Change of the misfit, as a fraction, below which states and parameters are no longer updated in turn."""
+SETTLED = 0.5
+"""Standard errors by which a turn of initial states and parameters moves these when it is the last."""
 
 
 def eliminate(state: State, library: Library, rules: Selection, progress: Progress) -> State:
@@ -49,9 +51,9 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
     for _ in range(state.study.procedure.last_turns):
         # they were those of a model that lacked its last effect
         study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)
-        again, before = refit(study, state.fitted.model), state.fitted.misfit
+        again, before = refit(study, state.fitted.model), state.fitted.model.values
         state = replace(state, study=study, fitted=again).spent(again.evaluations)
-        if abs(again.misfit - before) < SETTLED * before:
+        if np.all(np.abs(again.model.values - before) <= SETTLED * _standard_errors(state)):
             break
     study = inflate(state.study, state.fitted, memory=True)
     progress(done=state.replays, total=None, best=nan, note="final fit")
@@ -63,6 +65,15 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
     if real is not None:
         state = with_intervals(real.step(removed=_gone(state, real)), rules)
     return state
+
+
+def _standard_errors(state: State) -> FloatArray:
+    """(p,) of the parameters of a fitted model."""
+    model = state.fitted.model
+    problem = state.study.train_problem(model)
+    residual, jacobian = linearise(problem, model.values, step=state.study.stencil(model.terms))
+    cov, _ = spread(np.nan_to_num(jacobian), residual, problem.blocks)
+    return np.asarray(np.sqrt(np.diag(cov)))
 
 
 def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:

@@ -374,7 +374,9 @@ def _reach(model: mujoco.MjModel, base: BaseState) -> FloatArray:
     centres = [Foot(f.name, model.body(f.name).ipos[None], np.zeros(1)) for f in feet]
     middles = points_in_base(model, centres, addresses, base.joint_position)
     result = np.zeros((len(rotation), len(feet), 6, 6))
-    for k, (foot, points) in enumerate(zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True)):
+    for k, (foot, points) in enumerate(
+        zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True)
+    ):
         arm = np.einsum("nij,nkj->nki", rotation, points - middles[k])
         arm[:, :, 2] -= foot.radius
         above = arm[:, :, 2] - arm[:, :, 2].min(axis=1, keepdims=True)
@@ -690,7 +692,7 @@ def moved_chain(chain: Chain, known: Derivatives, found: Round, change: FloatArr
     rest = found.ends.defect + np.einsum("nij,nj->ni", known.start, move[:-1]) - move[1:]
     rest = rest + found.ends.by_number @ change
     # least-norm forces, each in its own size, that explain what the steps leave open
-    sizes, forces, total = unexplained(chain, known)
+    _, forces, total = unexplained(chain, known)
     linked = chain.linked[:, None, None]
     forces, total = np.where(linked, forces, 0.0), np.where(linked, total, np.eye(d))
     rest = np.where(linked[:, :, 0], rest, 0.0)

@@ -118,7 +118,8 @@ class Filter:
     carry, push : (n - 1, d, d), (n - 1, d) error of the state that is expected of the next sample, from that of this
         one, and from what this one measures.
     sight, seen : (n, j, d), (n, j) whitened joint innovations: `seen` less what `sight` makes of the expected error.
-    share : (n, j) mean square of these where the model is right: less than one by what unknown forces take.
+    share : (n, j) mean square of these where the model is right: less than one by what unknown forces take, and where
+        gains allow for a model that errs.
     late : (n - 1, d) what steps do where commands come a second later.
     """
 
@@ -211,7 +212,10 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
     """
     (n, j), count = chain.states.joint_position.shape, known.mean.shape[2]
     sizes, forces, unknown = unexplained(chain, known)
-    noise = _without_base(np.delete(unknown, BLIND, axis=1))
+    noise, fair = (
+        _without_base(np.delete(total, BLIND, axis=1))
+        for total in (unknown, unexplained(replace(chain, slack=1.0), known)[2])
+    )
     # what is as good as free: mean forces on the feet, which come first, and what joints hold, which comes last
     mean, beside = (np.delete(part, BLIND, axis=1) for part in np.split(forces, [count, len(sizes)], axis=2)[::2])
     steady = np.concatenate([mean, beside], axis=2)
@@ -226,6 +230,7 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
     moved, pushed = np.zeros((n, d)), np.zeros((n - 1, count))
     white_sight, white_seen, share = np.zeros((n, j, d)), np.zeros((n, j)), np.ones((n, j))
     cov, error = prior, np.zeros(d)
+    right = prior  # the error, whatever the gains, where the model is right
     for k in range(n):
         own = sight[k]
         total = own @ cov @ own.T + np.eye(len(own))
@@ -234,6 +239,7 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
         values, vectors = np.linalg.eigh(total[:j, :j] - total[:j, j:] @ by_imu)
         whiten = (vectors / np.sqrt(values)) @ vectors.T @ np.hstack([np.eye(j), -by_imu.T])
         white_sight[k], white_seen[k] = whiten @ own, -whiten @ left[k]
+        share[k] = np.einsum("ij,jk,ik->i", whiten, own @ right @ own.T + np.eye(len(own)), whiten)
         if k and chain.linked[k - 1]:
             share[k] -= np.sum((white_sight[k] @ steady[k - 1]) ** 2, axis=1)
             pushed[k - 1] = -mean[k - 1].T @ own.T @ np.linalg.solve(total, left[k] + own @ error)
@@ -243,14 +249,16 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
         if k == n - 1:
             break
         if not chain.linked[k]:
-            cov, error = prior, np.zeros(d)
+            cov, right, error = prior, prior, np.zeros(d)
             continue
         # predictions begin where the states have moved to
         carry[k], push[k] = start[k] @ keep, -start[k] @ (gain @ left[k] + moved[k])
         error = start[k] @ moved[k] + defect[k]
         # Joseph's form: what is subtracted is nearly all there is
-        cov = keep @ cov @ keep.T + gain @ gain.T
-        cov = start[k] @ cov @ start[k].T + noise[k]
+        cov, right = (
+            start[k] @ (keep @ of @ keep.T + gain @ gain.T) @ start[k].T + added[k]
+            for of, added in ((cov, noise), (right, fair))
+        )
         cov = 0.5 * (cov + cov.T)
     whole = np.zeros((n, d + len(BLIND)))
     whole[:, np.delete(np.arange(d + len(BLIND)), BLIND)] = moved
@@ -303,7 +311,7 @@ class InnovationsProcedure(Procedure):
 
     demand: ClassVar[int] = 1
     alternations: ClassVar[tuple[int, ...]] = (5, 5)
-    last_turns: ClassVar[int] = 4
+    last_turns: ClassVar[int] = 8
     coarse_suffices: ClassVar[bool] = True
     refines_step: ClassVar[bool] = False
     moves_split: ClassVar[bool] = False
@@ -533,5 +541,4 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
 def filter_at(chain: Chain, known: Derivatives, values: FloatArray) -> Filter:
     """The filter of a chain about its states under a candidate."""
     ends = simulate_chain(chain, values, np.arange(0), np.zeros(0))
-    # the right model errs by no more than the least slack
-    return kalman_filter(replace(chain, slack=1.0), known, ends.defect, ends.by_number[:, :, -1])
+    return kalman_filter(chain, known, ends.defect, ends.by_number[:, :, -1])
