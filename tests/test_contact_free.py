@@ -88,16 +88,17 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
         sigma=np.where(rng.random((n, joints + 5)) < 0.2, np.inf, 0.5),
         time=np.arange(n) * 0.02,
         size=replace(NAO, weight=0.01),
+        reach=0.01 * (np.eye(6) + 0.1 * rng.normal(size=(w, feet, 6, 6))),
     )
     shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3, (w, d, joints)]
     known = chain_module.Derivatives(*(0.1 * rng.normal(size=s) for s in shapes))
     ends = chain_module.Ends(1e-3 * rng.normal(size=(w, d)), 1e-3 * rng.normal(size=(w, d, p)))
     found = chain_module.linearise_chain(chain, known, ends)
 
-    sizes, forces, _ = chain_module.unexplained(chain, known)
+    forces, _ = chain_module.unexplained(chain, known)
     slack, loose = (chain_module.each_of(kinds, chain) for kinds in (chain_module.SLACK, chain_module.LOOSE))
     sight, seen = chain_module.measurements(chain)
-    k = len(sizes)
+    k = forces.shape[2]
     unknown = n * d + w * k
     rows, rests, numbers = [np.zeros((n * d, unknown))], [np.zeros(n * d)], [np.zeros((n * d, p))]
     rows[0][:, : n * d] = np.diag(1 / np.tile(loose, n))
@@ -193,3 +194,18 @@ def test_logs_that_do_not_suit_are_left_alone(on_springs: OnSprings) -> None:
     assert not chain_module.suits(replace(replay, numerics=replace(replay.numerics, servo_period=0.01)))
     short = replay.log.window(0, chain_module.LEAST - 1)
     assert not chain_module.suits(replace(replay, log=short))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_the_ground_presses_on_the_lowest_points_of_a_foot(tilt: float) -> None:
+    """Flat on its sole in the middle, give or take its half diagonal; on its edge, give or take half of that."""
+    length, width, height = 0.08, 0.04, 0.03
+    sole = np.array([[x, y, -height] for x in (-length, length) for y in (-width, width)])
+    turn = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+    (reach,) = chain_module.pressed((sole @ turn.T)[None], NAO)
+    middle = turn @ [length if tilt else 0.0, 0.0, -height]
+    force = np.array([3.0, -2.0, 40.0])
+    pushed = reach @ np.append(force / NAO.weight, np.zeros(3))
+    np.testing.assert_allclose(pushed, np.append(force, np.cross(middle, force)), atol=1e-9)
+    beside = np.hypot(width if tilt else np.hypot(length, width), chain_module.BESIDE)
+    np.testing.assert_allclose(reach[3:, 3:], NAO.weight * beside * np.eye(3), rtol=1e-6)

@@ -50,18 +50,23 @@ def random_chain(rng: np.random.Generator, linked: Sequence[bool]) -> tuple[Chai
         sigma=np.where(rng.random((n, joints + 5)) < 0.2, np.inf, 0.5),
         time=np.arange(n) * 0.02,
         size=replace(NAO, weight=0.01),
+        reach=np.empty(0),
     )
     shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3, (w, d, joints)]
-    return chain, Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
+    known = Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
+    return replace(chain, reach=0.01 * (np.eye(6) + 0.1 * rng.normal(size=(w, feet, 6, 6)))), known
 
 
-def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
-    chain, known = random_chain(np.random.default_rng(4), [True, True, False, True])
+def by_noise(
+    chain: Chain, known: Derivatives, monkeypatch: pytest.MonkeyPatch, slack: float = 1.0
+) -> tuple[np.ndarray, innovations.Filter]:
+    """Innovations (n j, r) of every unit of noise where the model is right, under gains that allow for so much slack;
+    and the filter."""
     states, linked = chain.states, chain.linked
     (n, joints), (w, d) = states.joint_position.shape, known.start.shape[:2]
     keep = np.setdiff1d(np.arange(d), chain_module.BLIND)
     sight = chain_module.measurements(chain)[0]
-    total = chain_module.unexplained(chain, known)[2][:, keep][:, :, keep]
+    total = chain_module.unexplained(chain, known)[1][:, keep][:, :, keep]
     prior = chain_module.each_of(chain_module.LOOSE, chain)[keep]
 
     def shown(start: np.ndarray, moved: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -74,7 +79,7 @@ def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.Monk
             elif k < w:
                 error = prior * start[1]
         monkeypatch.setattr(innovations, "measurements", lambda _: (sight, np.array(seen)))
-        own = kalman_filter(chain, known, *np.zeros((2, w, d)))
+        own = kalman_filter(replace(chain, slack=slack), known, *np.zeros((2, w, d)))
         # what steps that are linear miss of the states, from where they begin and under the forces they have
         moved_by, force = chain_module.difference(own.filtered, states)[:-1], own.wrench.reshape(w, -1)
         missed = np.einsum("kij,kj->ki", known.start, moved_by) + np.einsum("kij,kj->ki", known.mean, force)
@@ -86,8 +91,22 @@ def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.Monk
     for unit in np.eye(count):
         parts = np.split(unit, np.cumsum([a * b for a, b in sizes])[:-1])
         columns.append(shown(*(part.reshape(size) for part, size in zip(parts, sizes, strict=True))))
-    by_noise = np.column_stack(columns)
-    np.testing.assert_allclose(by_noise @ by_noise.T, np.eye(n * joints), atol=1e-7)
+    return np.column_stack(columns), kalman_filter(replace(chain, slack=slack), known, *np.zeros((2, w, d)))
+
+
+def test_innovations_are_white_where_the_model_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, own = by_noise(*random_chain(np.random.default_rng(4), [True, True, False, True]), monkeypatch)
+    np.testing.assert_allclose(shown @ shown.T, np.eye(own.share.size), atol=1e-7)
+
+
+def test_what_the_right_model_leaves_is_known_under_gains_that_allow_for_a_wrong_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    chain, known = random_chain(np.random.default_rng(4), [True, True, False, True])
+    known = replace(known, mean=np.zeros_like(known.mean))  # whose share is not the noise's
+    shown, own = by_noise(chain, known, monkeypatch, slack=125.0)
+    np.testing.assert_allclose(np.sum(shown**2, axis=1), own.share.ravel(), rtol=1e-6)
+    assert own.share.min() < 0.98
 
 
 def test_a_sample_is_predicted_from_what_was_before_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,8 @@ BLIND = (0, 1, 2, 6, 7, 8)
 """Of a state: position and velocity of the base, on which without contact nothing else depends."""
 STEADY = 20.0
 """Standard deviation of the mean force on a foot over a sample, in weights of the robot: as good as free."""
-STEADY_KINDS = (STEADY, STEADY, STEADY, 1.0, 1.0, 1.0)
+KINDS = (STEADY, STEADY, STEADY, 1.0, 1.0, 1.0)
+"""The same of what `Chain.reach` has, force and torque: how far off the middle one weight acts."""
 LOW, BESIDE = 0.005, 0.01
 """m, height above a foot's lowest point within which others of its points press on the ground too, and standard
 deviation of where the force acts beside the middle of these and their own spread: soles give, feet roll."""
@@ -370,25 +371,33 @@ def _reach(model: mujoco.MjModel, base: BaseState) -> FloatArray:
     """`Chain.reach` of the steps between samples."""
     feet = touching_bodies(model)
     addresses = np.array([model.jnt_qposadr[model.joint(j).id] for j in base.joints], dtype=np.int64)
-    size, rotation = base.size, base.rotation
     centres = [Foot(f.name, model.body(f.name).ipos[None], np.zeros(1)) for f in feet]
-    middles = points_in_base(model, centres, addresses, base.joint_position)
-    result = np.zeros((len(rotation), len(feet), 6, 6))
-    for k, (foot, points) in enumerate(
-        zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True)
-    ):
-        arm = np.einsum("nij,nkj->nki", rotation, points - middles[k])
+    outlines, middles = (points_in_base(model, of, addresses, base.joint_position) for of in (feet, centres))
+    parts = []
+    for foot, points, middle in zip(feet, outlines, middles, strict=True):
+        arm = np.einsum("nij,nkj->nki", base.rotation, points - middle)
         arm[:, :, 2] -= foot.radius
-        above = arm[:, :, 2] - arm[:, :, 2].min(axis=1, keepdims=True)
-        share = np.exp(-0.5 * (above / size.length(LOW)) ** 2)
-        share /= share.sum(axis=1, keepdims=True)
-        middle = np.einsum("nk,nki->ni", share, arm)
-        spread = np.einsum("nk,nki->n", share, (arm - middle[:, None]) ** 2)
-        result[:, k, [0, 1, 2], [0, 1, 2]] = 1.0
-        for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
-            result[:, k, 3 + i, b], result[:, k, 3 + i, a] = middle[:, a], -middle[:, b]
-            result[:, k, 3 + i, 3 + i] = np.sqrt(spread + size.length(BESIDE) ** 2)
-    return size.weight * 0.5 * (result[:-1] + result[1:])
+        parts.append(pressed(arm, base.size))
+    reach = np.stack(parts, axis=1)
+    return np.asarray(0.5 * (reach[:-1] + reach[1:]))
+
+
+def pressed(arm: FloatArray, size: BodySize) -> FloatArray:
+    """(n, 6, 6) as `Chain.reach`, of a foot with its outermost points at (n, k, 3) from its centre of mass.
+
+    Where the ground presses is known to be within the foot: in the middle of its lowest points, give or take how far
+    they are apart. So torques on it are no more free than that, which tells gains and masses from forces.
+    """
+    above = arm[:, :, 2] - arm[:, :, 2].min(axis=1, keepdims=True)
+    share = np.exp(-0.5 * (above / size.length(LOW)) ** 2)
+    share /= share.sum(axis=1, keepdims=True)
+    middle = np.einsum("nk,nki->ni", share, arm)
+    spread = np.einsum("nk,nki->n", share, (arm - middle[:, None]) ** 2)
+    result = np.zeros((len(arm), 6, 6))
+    result[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    result[:, 3:, :3] = np.cross(middle[:, None], np.eye(3)).transpose(0, 2, 1)
+    result[:, [3, 4, 5], [3, 4, 5]] = np.sqrt(spread + size.length(BESIDE) ** 2)[:, None]
+    return size.weight * result
 
 
 def _touching(model: mujoco.MjModel, walk: Log, base: BaseState) -> BoolArray:
@@ -594,7 +603,7 @@ def linearise_chain(chain: Chain, known: Derivatives, ends: Ends) -> Round:
     if not np.isfinite(right).all():  # a simulation failed
         return failed
     try:
-        factor = np.linalg.cholesky(np.where(linked, unexplained(chain, known)[2], np.eye(d)))
+        factor = np.linalg.cholesky(np.where(linked, unexplained(chain, known)[1], np.eye(d)))
         white = np.linalg.solve(factor, right)
         before, after, sides = white[:, :, :d], -white[:, :, d : 2 * d], white[:, :, 2 * d :]
         # what the candidate as it is leaves comes first, then a unit of each number
@@ -624,20 +633,22 @@ def linearise_chain(chain: Chain, known: Derivatives, ends: Ends) -> Round:
     return Round(left, blocks, surprise, solved, ends)
 
 
-def unexplained(chain: Chain, known: Derivatives) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sizes of the unknown forces (18 f,), what one of its size does (w, d, 18 f), and the covariance of their sum.
+def unexplained(chain: Chain, known: Derivatives) -> tuple[FloatArray, FloatArray]:
+    """What unknown forces of their size do, (w, d, 18 f), and the covariance of all that they and the slack do.
 
-    What joints hold that may stand still comes after the forces, (w, d, 18 f + j).
+    Mean forces come first, then blows at the start and at the end; last, (w, d, 18 f + j), what joints hold that may
+    stand still.
     """
-    count = chain.reach[0, :, 0].size
-    jolt = chain.size.time(chain.jolt)
-    kinds = np.tile(STEADY_KINDS, count // 6)
-    sizes = np.concatenate([kinds, np.full(2 * count, jolt)])
-    parts = (known.mean, known.blow, known.last)
-    forces = np.concatenate([_at_contact(chain, part) for part in parts], axis=2) * sizes
+    kinds, jolt = np.tile(KINDS, chain.touch.shape[1]), np.array(chain.size.time(chain.jolt))
+    sizes = (kinds, jolt, jolt)
+    parts = [
+        _at_contact(chain, part) * of for part, of in zip((known.mean, known.blow, known.last), sizes, strict=True)
+    ]
     if chain.held is not None:
-        forces = np.concatenate([forces, known.joint * (chain.held * chain.steps.still)[:, None]], axis=2)
-    return sizes, forces, forces @ forces.transpose(0, 2, 1) + np.diag((chain.slack * each_of(SLACK, chain)) ** 2)
+        parts.append(known.joint * (chain.held * chain.steps.still)[:, None])
+    forces = np.concatenate(parts, axis=2)
+    slack = (chain.slack * each_of(SLACK, chain)) ** 2
+    return forces, forces @ forces.transpose(0, 2, 1) + np.diag(slack)
 
 
 def _at_contact(chain: Chain, part: FloatArray) -> FloatArray:
@@ -650,7 +661,7 @@ def _at_contact(chain: Chain, part: FloatArray) -> FloatArray:
 def acting(chain: Chain, pushed: FloatArray) -> FloatArray:
     """(w, f, 6) forces and torques on the feet of (w, 6 f) unknown ones of the size of their own."""
     w, f = chain.touch.shape
-    return np.asarray(np.einsum("wfij,wfj->wfi", chain.reach, pushed.reshape(w, f, 6) * STEADY_KINDS))
+    return np.asarray(np.einsum("wfij,wfj->wfi", chain.reach, pushed.reshape(w, f, 6) * KINDS))
 
 
 def each_of(kinds: Sequence[float], chain: Chain) -> FloatArray:
@@ -692,7 +703,7 @@ def moved_chain(chain: Chain, known: Derivatives, found: Round, change: FloatArr
     rest = found.ends.defect + np.einsum("nij,nj->ni", known.start, move[:-1]) - move[1:]
     rest = rest + found.ends.by_number @ change
     # least-norm forces, each in its own size, that explain what the steps leave open
-    _, forces, total = unexplained(chain, known)
+    forces, total = unexplained(chain, known)
     linked = chain.linked[:, None, None]
     forces, total = np.where(linked, forces, 0.0), np.where(linked, total, np.eye(d))
     rest = np.where(linked[:, :, 0], rest, 0.0)

@@ -121,6 +121,7 @@ class Filter:
     share : (n, j) mean square of these where the model is right: less than one by what unknown forces take, and where
         gains allow for a model that errs.
     late : (n - 1, d) what steps do where commands come a second later.
+    misfit : mean square of the joint innovations over that where the model is right.
     """
 
     states: Segments
@@ -133,6 +134,7 @@ class Filter:
     seen: FloatArray
     share: FloatArray
     late: FloatArray
+    misfit: float
 
     def part(self, start: int, stop: int) -> Filter:
         """The filter of the samples from `start` to before `stop`."""
@@ -148,6 +150,7 @@ class Filter:
             self.seen[samples],
             self.share[samples],
             self.late[between],
+            self.misfit,
         )
 
     def defects(self, outputs: Outputs) -> FloatArray:
@@ -211,13 +214,13 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
     late : (n - 1, d) derivative of the ends of steps by the time that commands come later.
     """
     (n, j), count = chain.states.joint_position.shape, known.mean.shape[2]
-    sizes, forces, unknown = unexplained(chain, known)
+    forces, unknown = unexplained(chain, known)
     noise, fair = (
         _without_base(np.delete(total, BLIND, axis=1))
-        for total in (unknown, unexplained(replace(chain, slack=1.0), known)[2])
+        for total in (unknown, unexplained(replace(chain, slack=1.0), known)[1])
     )
     # what is as good as free: mean forces on the feet, which come first, and what joints hold, which comes last
-    mean, beside = (np.delete(part, BLIND, axis=1) for part in np.split(forces, [count, len(sizes)], axis=2)[::2])
+    mean, beside = (np.delete(part, BLIND, axis=1) for part in np.split(forces, [count, 3 * count], axis=2)[::2])
     steady = np.concatenate([mean, beside], axis=2)
     start = _without_base(np.delete(known.start, BLIND, axis=1))
     sight, left = measurements(chain)
@@ -229,7 +232,7 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
     carry, push = np.zeros((n - 1, d, d)), np.zeros((n - 1, d))
     moved, pushed = np.zeros((n, d)), np.zeros((n - 1, count))
     white_sight, white_seen, share = np.zeros((n, j, d)), np.zeros((n, j)), np.ones((n, j))
-    cov, error = prior, np.zeros(d)
+    cov, error, left_over = prior, np.zeros(d), 0.0
     right = prior  # the error, whatever the gains, where the model is right
     for k in range(n):
         own = sight[k]
@@ -239,6 +242,7 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
         values, vectors = np.linalg.eigh(total[:j, :j] - total[:j, j:] @ by_imu)
         whiten = (vectors / np.sqrt(values)) @ vectors.T @ np.hstack([np.eye(j), -by_imu.T])
         white_sight[k], white_seen[k] = whiten @ own, -whiten @ left[k]
+        left_over += float(np.sum((whiten @ (left[k] + own @ error)) ** 2))
         share[k] = np.einsum("ij,jk,ik->i", whiten, own @ right @ own.T + np.eye(len(own)), whiten)
         if k and chain.linked[k - 1]:
             share[k] -= np.sum((white_sight[k] @ steady[k - 1]) ** 2, axis=1)
@@ -265,7 +269,10 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
     assert chain.steps.wrench is not None
     wrench = chain.steps.wrench + acting(chain, pushed)
     filtered = chain.states.moved(whole)
-    return Filter(chain.states, filtered, wrench, chain.linked, carry, push, white_sight, white_seen, share, late)
+    misfit = left_over / float(share.sum())
+    return Filter(
+        chain.states, filtered, wrench, chain.linked, carry, push, white_sight, white_seen, share, late, misfit
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -539,6 +546,14 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
 
 
 def filter_at(chain: Chain, known: Derivatives, values: FloatArray) -> Filter:
-    """The filter of a chain about its states under a candidate."""
+    """The filter of a chain about its states under a candidate.
+
+    A model that leaves more than the right one does errs, and its gains allow for it: what it lacks would lead all of
+    its numbers astray. Gains of the right one do not, as what they allow for is lost for its numbers.
+    """
     ends = simulate_chain(chain, values, np.arange(0), np.zeros(0))
-    return kalman_filter(chain, known, ends.defect, ends.by_number[:, :, -1])
+    late = ends.by_number[:, :, -1]
+    strict = kalman_filter(replace(chain, slack=1.0), known, ends.defect, late)
+    if strict.misfit <= InnovationsProcedure.tolerated:
+        return strict
+    return kalman_filter(chain, known, ends.defect, late)
