@@ -491,7 +491,7 @@ class InnovationsEpisode(Episode):
                 )
             with phase("states of the base", 0.9):
                 chain, known = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
-            return chain, known, filter_at(chain, known, terms.nominal)
+            return chain, known, filter_at(chain, known, terms.nominal, fitted=False)
 
         key = ("innovations", self.robot.fingerprint, self.robot.at, numerics)
         chain, known, own = self.recording.once(key, begin)
@@ -545,15 +545,15 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
     return chain, known
 
 
-def filter_at(chain: Chain, known: Derivatives, values: FloatArray) -> Filter:
+def filter_at(chain: Chain, known: Derivatives, values: FloatArray, *, fitted: bool = True) -> Filter:
     """The filter of a chain about its states under a candidate.
 
-    A model that leaves more than the right one does errs, and its gains allow for it: what it lacks would lead all of
-    its numbers astray. Gains of the right one do not, as what they allow for is lost for its numbers.
+    A model that is `fitted` and leaves more than the right one does errs, and its gains allow for it: what it lacks
+    would lead all of its numbers astray. Others do not, as what gains allow for is lost for the numbers.
     """
     ends = simulate_chain(chain, values, np.arange(0), np.zeros(0))
     late = ends.by_number[:, :, -1]
     strict = kalman_filter(replace(chain, slack=1.0), known, ends.defect, late)
-    if strict.misfit <= InnovationsProcedure.tolerated:
+    if not fitted or strict.misfit <= InnovationsProcedure.tolerated:
         return strict
     return kalman_filter(chain, known, ends.defect, late)
