@@ -50,11 +50,10 @@ def random_chain(rng: np.random.Generator, linked: Sequence[bool]) -> tuple[Chai
         sigma=np.where(rng.random((n, joints + 5)) < 0.2, np.inf, 0.5),
         time=np.arange(n) * 0.02,
         size=replace(NAO, weight=0.01),
-        reach=np.empty(0),
+        reach=0.01 * (np.eye(6) + 0.1 * np.random.default_rng(0).normal(size=(w, feet, 6, 6))),
     )
     shapes = [(w, d, d), *[(w, d, 6 * feet)] * 3, (w, d, joints)]
-    known = Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
-    return replace(chain, reach=0.01 * (np.eye(6) + 0.1 * rng.normal(size=(w, feet, 6, 6)))), known
+    return chain, Derivatives(*(0.3 * rng.normal(size=shape) for shape in shapes))
 
 
 def by_noise(

@@ -29,7 +29,7 @@ from sysid_btr.estimators.base import Progress, without_loss
 from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.refit import Fitted, inflate, refit, shorten
 from sysid_btr.identify.study import Study
-from sysid_btr.objectives.covariance import spread
+from sysid_btr.objectives.covariance import covariance
 from sysid_btr.terms.effect import Effect
 
 Wanted = Callable[[Selection, Fitted, Fitted], bool]
@@ -72,8 +72,7 @@ def _standard_errors(state: State) -> FloatArray:
     model = state.fitted.model
     problem = state.study.train_problem(model)
     residual, jacobian = linearise(problem, model.values, step=state.study.stencil(model.terms))
-    cov, _ = spread(np.nan_to_num(jacobian), residual, problem.blocks)
-    return np.asarray(np.sqrt(np.diag(cov)))
+    return np.asarray(np.sqrt(np.diag(covariance(np.nan_to_num(jacobian), residual, problem.blocks))))
 
 
 def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:

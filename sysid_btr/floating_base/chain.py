@@ -17,8 +17,8 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.floating_base.attitude import NEAR
-from sysid_btr.floating_base.estimate import BaseState, foot_loads, lowest_points
-from sysid_btr.floating_base.feet import Foot, points_in_base, touching_bodies
+from sysid_btr.floating_base.estimate import foot_loads, foot_surfaces
+from sysid_btr.floating_base.feet import Foot, touching_bodies
 from sysid_btr.floating_base.segments import FloatingReplay, starts_at, whole_step
 from sysid_btr.floating_base.size import BodySize
 from sysid_btr.io.log import Log
@@ -339,10 +339,17 @@ def chain_of(replay: FloatingReplay) -> Chain:
     states = starts_at(base, np.stack([np.arange(n), np.arange(n) + 2], axis=1))
     own = {f.name: getattr(replay, f.name) for f in fields(replay)} | {"effort": False}
     steps = SampleSteps(**{**own, "segments": states.chosen(np.arange(n - 1))})
-    near = _touching(steps.model, walk, base)
+    feet = touching_bodies(steps.model)
+    centres = [Foot(f.name, steps.model.body(f.name).ipos[None], np.zeros(1)) for f in feet]
+    surfaces = foot_surfaces(steps.model, [*feet, *centres], base)
+    surfaces, middles = surfaces[: len(feet)], surfaces[len(feet) :]
+    low = np.stack([surface[:, :, 2].min(axis=1) for surface in surfaces], axis=1)
+    near = _touching(low, foot_loads(steps.model, feet, walk, []), base.size)
     touch = near[:-1] | near[1:]
     share = touch / np.maximum(touch.sum(axis=1, keepdims=True), 1)
-    reach = _reach(steps.model, base)
+    arms = (surface - middle for surface, middle in zip(surfaces, middles, strict=True))
+    reach = np.stack([pressed(arm, base.size) for arm in arms], axis=1)
+    reach = 0.5 * (reach[:-1] + reach[1:])
     force = np.zeros((n - 1, touch.shape[1], 6))
     force[:, :, 2] = share
     wrench = np.einsum("wfij,wfj->wfi", reach, force)
@@ -367,21 +374,6 @@ def chain_of(replay: FloatingReplay) -> Chain:
     )
 
 
-def _reach(model: mujoco.MjModel, base: BaseState) -> FloatArray:
-    """`Chain.reach` of the steps between samples."""
-    feet = touching_bodies(model)
-    addresses = np.array([model.jnt_qposadr[model.joint(j).id] for j in base.joints], dtype=np.int64)
-    centres = [Foot(f.name, model.body(f.name).ipos[None], np.zeros(1)) for f in feet]
-    outlines, middles = (points_in_base(model, of, addresses, base.joint_position) for of in (feet, centres))
-    parts = []
-    for foot, points, middle in zip(feet, outlines, middles, strict=True):
-        arm = np.einsum("nij,nkj->nki", base.rotation, points - middle)
-        arm[:, :, 2] -= foot.radius
-        parts.append(pressed(arm, base.size))
-    reach = np.stack(parts, axis=1)
-    return np.asarray(0.5 * (reach[:-1] + reach[1:]))
-
-
 def pressed(arm: FloatArray, size: BodySize) -> FloatArray:
     """(n, 6, 6) as `Chain.reach`, of a foot with its outermost points at (n, k, 3) from its centre of mass.
 
@@ -400,16 +392,16 @@ def pressed(arm: FloatArray, size: BodySize) -> FloatArray:
     return size.weight * result
 
 
-def _touching(model: mujoco.MjModel, walk: Log, base: BaseState) -> BoolArray:
-    """Which feet may touch, (n, f): rather too often than too seldom, by a sample either way."""
-    feet = touching_bodies(model)
-    load = foot_loads(model, feet, walk, [])
-    low = lowest_points(model, feet, base)
+def _touching(low: FloatArray, load: FloatArray | None, size: BodySize) -> BoolArray:
+    """Which feet may touch, (n, f): rather too often than too seldom, by a sample either way.
+
+    By the height (n, f) of their lowest points, m, and the force on them, N, where that is measured.
+    """
     above = low - low.min(axis=1, keepdims=True)
     if load is None:
-        near = above < base.size.length(NEAR)
+        near = above < size.length(NEAR)
     else:
-        near = (above < base.size.length(LOWEST_LOADED)) | (load > LIGHTEST * float(np.median(load.sum(axis=1))))
+        near = (above < size.length(LOWEST_LOADED)) | (load > LIGHTEST * float(np.median(load.sum(axis=1))))
     wide: BoolArray = near.copy()
     wide[1:] |= near[:-1]
     wide[:-1] |= near[1:]
@@ -639,11 +631,9 @@ def unexplained(chain: Chain, known: Derivatives) -> tuple[FloatArray, FloatArra
     Mean forces come first, then blows at the start and at the end; last, (w, d, 18 f + j), what joints hold that may
     stand still.
     """
-    kinds, jolt = np.tile(KINDS, chain.touch.shape[1]), np.array(chain.size.time(chain.jolt))
-    sizes = (kinds, jolt, jolt)
-    parts = [
-        _at_contact(chain, part) * of for part, of in zip((known.mean, known.blow, known.last), sizes, strict=True)
-    ]
+    kinds, jolt = np.tile(KINDS, chain.touch.shape[1]), chain.size.time(chain.jolt)
+    mean, blow, last = (_at_contact(chain, part) for part in (known.mean, known.blow, known.last))
+    parts = [mean * kinds, blow * jolt, last * jolt]
     if chain.held is not None:
         parts.append(known.joint * (chain.held * chain.steps.still)[:, None])
     forces = np.concatenate(parts, axis=2)

@@ -291,14 +291,15 @@ def find_contacts(bottom: FloatArray, load: FloatArray | None, size: BodySize) -
     return np.asarray((held > LOADED * weight) & (above < size.length(LOWEST)))
 
 
-def lowest_points(model: mujoco.MjModel, feet: Sequence[Foot], base: BaseState) -> FloatArray:
-    """(n, f) height of each foot's lowest point above the base's origin, m (negative down)."""
+def foot_surfaces(model: mujoco.MjModel, feet: Sequence[Foot], base: BaseState) -> list[FloatArray]:
+    """Undersides of the outermost points of each foot, (n, k, 3), m from the base's origin in the world's axes."""
     addresses = np.array([model.jnt_qposadr[model.joint(j).id] for j in base.joints], dtype=np.int64)
-    low = [
-        (np.einsum("nj,nkj->nk", base.rotation[:, 2], points) - foot.radius).min(axis=1)
-        for foot, points in zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True)
-    ]
-    return np.stack(low, axis=1)
+    result = []
+    for foot, points in zip(feet, points_in_base(model, feet, addresses, base.joint_position), strict=True):
+        surface = np.einsum("nij,nkj->nki", base.rotation, points)
+        surface[:, :, 2] -= foot.radius
+        result.append(surface)
+    return result
 
 
 def _feet(model: mujoco.MjModel) -> tuple[Foot, ...]:

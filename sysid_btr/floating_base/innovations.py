@@ -121,7 +121,7 @@ class Filter:
     share : (n, j) mean square of these where the model is right: less than one by what unknown forces take, and where
         gains allow for a model that errs.
     late : (n - 1, d) what steps do where commands come a second later.
-    misfit : mean square of the joint innovations over that where the model is right.
+    misfit : mean square of the joint innovations over that where the model is right, of the whole walk.
     """
 
     states: Segments
@@ -259,11 +259,9 @@ def kalman_filter(chain: Chain, known: Derivatives, defect: FloatArray, late: Fl
         carry[k], push[k] = start[k] @ keep, -start[k] @ (gain @ left[k] + moved[k])
         error = start[k] @ moved[k] + defect[k]
         # Joseph's form: what is subtracted is nearly all there is
-        cov, right = (
-            start[k] @ (keep @ of @ keep.T + gain @ gain.T) @ start[k].T + added[k]
-            for of, added in ((cov, noise), (right, fair))
-        )
-        cov = 0.5 * (cov + cov.T)
+        cov = start[k] @ (keep @ cov @ keep.T + gain @ gain.T) @ start[k].T + noise[k]
+        right = start[k] @ (keep @ right @ keep.T + gain @ gain.T) @ start[k].T + fair[k]
+        cov, right = 0.5 * (cov + cov.T), 0.5 * (right + right.T)
     whole = np.zeros((n, d + len(BLIND)))
     whole[:, np.delete(np.arange(d + len(BLIND)), BLIND)] = moved
     assert chain.steps.wrench is not None
