@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io import Log, LogMeta, read_log, sha256, write_log
+from sysid_btr.io.split import split_episodes
 
 
 def assert_same(a: Log, b: Log) -> None:
@@ -63,6 +65,19 @@ def test_window_cuts_every_column(good_log: Log) -> None:
 def test_columns_of_another_length_are_refused(good_log: Log) -> None:
     with pytest.raises(LogError, match=r"command\.HeadYaw \(3,\)"):
         replace(good_log, channels={"command.HeadYaw": np.zeros(3)})
+
+
+def test_what_is_found_of_an_episode_is_found_once(good_log: Log) -> None:
+    first, again = split_episodes(good_log), split_episodes(good_log)
+    assert all(one is other for one, other in zip(first, again, strict=True))
+    sought: list[int] = []
+    for (episode,) in (first, again):
+        episode.once(("test",), lambda: sought.append(1))
+    assert sought == [1]
+    # what is found goes neither into another process nor into a log that is made of this one
+    other: Log = pickle.loads(pickle.dumps(good_log))
+    for elsewhere in (other, good_log.window(0, len(good_log))):
+        assert split_episodes(elsewhere)[0] is not first[0]
 
 
 def test_episodes_are_runs_of_the_number(good_log: Log) -> None:

@@ -48,18 +48,20 @@ def holdout_split(log: Log, holdout: float = 0.3) -> tuple[Log, Log]:
     return log.window(0, cut), log.window(cut, len(log))
 
 
-def split_episodes(log: Log) -> list[Log]:
+def split_episodes(log: Log) -> tuple[Log, ...]:
     """Each episode of a log as a log of its own; those of a single sample are left out.
+
+    Asked again they are the same logs, so that what was found of them is not sought anew.
 
     Raises
     ------
     LogError
         If none is left.
     """
-    found = [log.window(rows.start, rows.stop) for rows in log.episodes() if rows.stop - rows.start > 1]
-    if not found:
+    long = [rows for rows in log.episodes() if rows.stop - rows.start > 1]
+    if not long:
         raise LogError(
             f"log {log.path or ''}: none of its {len(log.episodes())} episodes has two samples; leave `episode` out if "
             "it numbers the samples"
         )
-    return found
+    return log.once(("episodes",), lambda: tuple(log.window(rows.start, rows.stop) for rows in long))
