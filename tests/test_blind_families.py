@@ -29,11 +29,25 @@ def outcome(verdict: str, planted: Sequence[Effect], *named: dict[str, Any], eff
 
 KNEE = forms.AsymmetricFriction(where=("KneePitch",))
 BAND = forms.ElasticBand(where=("KneePitch",))
+SINE = forms.SineTorque(where=("HipRoll",))
 TABLE = [
     ("yes", "explained", [KNEE], [name("coulomb_friction", "KneePitch")]),
     ("yes", "partly_explained", [KNEE], [name("stribeck_friction", "KneePitch")]),
     ("yes", "explained", [KNEE], [name("coulomb_friction", "KneePitch"), name("constant_force", "KneePitch")]),
     ("wrong", "explained", [KNEE], [name("coulomb_friction", "KneePitch"), name("constant_force", "HipRoll")]),
+    (
+        "yes",
+        "explained",
+        [KNEE, SINE],
+        [name("coulomb_friction", "KneePitch"), name("constant_force", "KneePitch", "HipRoll")],
+    ),
+    (
+        "wrong",
+        "explained",
+        [KNEE, SINE],
+        [name("coulomb_friction", "KneePitch"), name("constant_force", "HipPitch", "HipRoll")],
+    ),
+    ("missed", "explained", [KNEE, SINE], [name("coulomb_friction", "KneePitch"), name("constant_force", "KneePitch")]),
     ("wrong", "explained", [KNEE], [name("coulomb_friction", "HipPitch")]),
     ("provisional", "partly_explained", [KNEE], [name("coulomb_friction", "HipPitch")]),
     ("wrong", "explained", [KNEE], [name("backlash", "KneePitch", confused=["coulomb_friction"])]),

@@ -159,7 +159,7 @@ def judge_families(result: Mapping[str, Any], effects: Sequence[Effect], robot: 
     effort : whether torques are logged.
     """
     verdict, true, named = result["verdict"], causes(effects, robot, effort), guesses(result["effects"])
-    own = {c: next((g for g in named if g.family in c.families and c.sits_at(g.where)), None) for c in true}
+    own = {c: next((g for g in named if _names(g, c, true)), None) for c in true}
     right = frozenset(g for g in own.values() if g is not None)
     false = [g for g in named if g not in right and not _part_of(g, true)]
     marked = tuple((g, g not in false) for g in named)
@@ -174,6 +174,12 @@ def judge_families(result: Mapping[str, Any], effects: Sequence[Effect], robot: 
         doubtful = verdict == "ambiguous" and bool(doubts)
         outcome, why = ("ambiguous", f"or {', '.join(sorted(doubts))}") if doubtful else ("yes", "")
     return FamilyJudgement(outcome, why, marked)
+
+
+def _names(guess: Guess, cause: Cause, true: Sequence[Cause]) -> bool:
+    """Whether a name is that of a cause, at its places; those where it is a part of another one do not count."""
+    beside = frozenset[str]().union(*(c.where for c in true if guess.family in c.beside))
+    return guess.family in cause.families and (cause.sits_at(guess.where) or cause.sits_at(guess.where - beside))
 
 
 def _part_of(guess: Guess, true: Sequence[Cause]) -> bool:
