@@ -15,7 +15,7 @@ import toys
 
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
-from sysid_btr.diagnosis.elimination import eliminate
+from sysid_btr.diagnosis.elimination import eliminate, without_dispensable
 from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
@@ -322,6 +322,26 @@ def test_a_tether_is_named_where_bodies_are_not_called_as_their_joints_and_its_p
     effect = only_effect(found)
     assert (found.verdict, effect.effect, effect.where) == ("explained", "tether", ("ankle_link",))
     assert amount_is(effect, 0, 2.9), effect
+
+
+def test_of_several_bodies_the_one_that_will_do_alone_stays() -> None:
+    """A cable at the body that carries the right one takes up a part of its pull, and by no small amount."""
+    pull = (2.0, 5.0, -0.5, 0.3, 0.4, 0.03, 0.0, -0.05)
+    study = make_study(toys.leg(), [recorded(Plant(Tether(KNEE), pull))], threads=1)
+    start = np.tile([1.0, 2.0, -0.5, 0.3, 0.4, 0.0, 0.0, 0.0], 2)
+    both = Hypothesis(Tether, ("hip", "knee"), False, start, 0.0)
+    trial = attempt(study, fit(study, TOY_FIT).model, both, STANDARD)
+    tension = trial.fitted.model.own(trial.fitted.model.terms[-1])[::8]
+    assert tension[0] > 0.5 * tension[1]
+    found, spent = without_dispensable(study, trial, STANDARD)
+    assert found.hypothesis.places == KNEE
+    assert spent > 0
+    # where each of two bodies has a load of its own, both stay
+    loads = (0.3, 0.05, 0.0, 0.0, 0.0, 0.4, 0.05, 0.0, 0.0, 0.0)
+    study = make_study(toys.leg(), [recorded(Plant(Payload(("hip", "knee")), loads))], threads=1)
+    both = Hypothesis(Payload, ("hip", "knee"), False, np.array(loads), 0.0)
+    trial = attempt(study, fit(study, TOY_FIT).model, both, STANDARD)
+    assert without_dispensable(study, trial, STANDARD)[0].hypothesis.places == ("hip", "knee")
 
 
 @pytest.mark.parametrize("had", [Backlash(("knee",)), Tether(("knee",))], ids=lambda had: had.name)

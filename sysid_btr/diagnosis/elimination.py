@@ -77,7 +77,8 @@ def _standard_errors(state: State) -> FloatArray:
 
 def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:
     """A trial without those locations of its group whose small amounts data do not miss; and what that took."""
-    spent, effect = 0, trial.hypothesis.effect
+    trial, spent = _at_one_body(study, trial, rules)
+    effect = trial.hypothesis.effect
     neutral = trial.hypothesis.term(study.scales).neutral[effect.main]
     while not trial.hypothesis.shared and 1 < len(trial.hypothesis.places) <= rules.largest_group:
         places, model = trial.hypothesis.places, trial.fitted.model
@@ -98,6 +99,25 @@ def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[T
             break
         trial = fewer
     return trial, spent
+
+
+def _at_one_body(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:
+    """A trial with its effect at that one body of a group which will do alone, if one does; and what that took.
+
+    What acts on one body moves those that carry it, and several of them together imitate it: how large each one's part
+    is says nothing of which it is.
+    """
+    hypothesis, model = trial.hypothesis, trial.fitted.model
+    places, effect = hypothesis.places, hypothesis.effect
+    if effect.scope != "body" or hypothesis.shared or not 1 < len(places) <= rules.largest_group:
+        return trial, 0
+    group = model.terms[-1]
+    rest, amounts = model.without(group), model.own(group).reshape(len(places), -1)
+    pairs = zip(places, amounts, strict=True)
+    alone = [attempt(study, rest, replace(hypothesis, places=(p,), start=own), rules) for p, own in pairs]
+    best = min(alone, key=lambda t: t.fitted.misfit)
+    spent = sum(t.fitted.evaluations for t in alone)
+    return (trial if is_missed(rules, best.fitted, trial.fitted) else best), spent
 
 
 def _pruned(state: State, rules: Selection) -> State:
