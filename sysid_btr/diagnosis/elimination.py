@@ -76,11 +76,11 @@ def _standard_errors(state: State) -> FloatArray:
 
 
 def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:
-    """A trial without those locations of its group whose small amounts data do not miss; and what that took."""
+    """A trial at fewer locations: one body that will do alone, none whose small amounts data do not miss; its cost."""
     trial, spent = _at_one_body(study, trial, rules)
     effect = trial.hypothesis.effect
     neutral = trial.hypothesis.term(study.scales).neutral[effect.main]
-    while not trial.hypothesis.shared and 1 < len(trial.hypothesis.places) <= rules.largest_group:
+    while _is_reducible(trial.hypothesis, rules):
         places, model = trial.hypothesis.places, trial.fitted.model
         group = model.terms[-1]
         amounts = model.own(group).reshape(-1, len(effect.kinds))
@@ -101,6 +101,11 @@ def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[T
     return trial, spent
 
 
+def _is_reducible(hypothesis: Hypothesis, rules: Selection) -> bool:
+    """Whether its locations have amounts of their own, and are few enough to be tried one by one."""
+    return not hypothesis.shared and 1 < len(hypothesis.places) <= rules.largest_group
+
+
 def _at_one_body(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:
     """A trial with its effect at that one body of a group which will do alone, if one does; and what that took.
 
@@ -109,7 +114,7 @@ def _at_one_body(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, i
     """
     hypothesis, model = trial.hypothesis, trial.fitted.model
     places, effect = hypothesis.places, hypothesis.effect
-    if effect.scope != "body" or hypothesis.shared or not 1 < len(places) <= rules.largest_group:
+    if effect.scope != "body" or not _is_reducible(hypothesis, rules):
         return trial, 0
     group = model.terms[-1]
     rest, amounts = model.without(group), model.own(group).reshape(len(places), -1)
