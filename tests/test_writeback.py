@@ -531,6 +531,19 @@ def test_a_urdf_becomes_mjcf(tmp_path: Path, out: Folder) -> None:
     }
 
 
+def test_a_load_on_a_body_of_a_urdf_is_in_its_mjcf(tmp_path: Path, out: Folder) -> None:
+    path = write_own(tmp_path / "mine").with_name("arm.urdf")
+    path.write_text(URDF)
+    robot = load_robot(str(path))
+    assert robot.make_spec().compiler.fusestatic  # a body that is welded on is no body of its own
+    load = effect(Payload, "upper")
+    values = [0.2, 0.01, 0.0, -0.1, 1e-4]
+    written = save_model(out, draft(model_of(study_of(robot, log=log_of(("hip",))), (load,), values)))
+    assert written["reproduces"]
+    after = mujoco.MjModel.from_xml_path(str(out.path / "model.xml"))
+    assert after.body("upper").mass == pytest.approx(0.3123456789012 + 0.2)
+
+
 # --- a fit ------------------------------------------------------------------------------------------------
 
 REPLAY = """

@@ -61,11 +61,13 @@ class Beside:
     plain : the robot without any term.
     numerics : integrator and step of the file.
     later : terms that act after this one.
+    fuses : whether the compiler makes one body of those that are welded together.
     """
 
     plain: mujoco.MjModel
     numerics: Numerics
     later: tuple[Term, ...]
+    fuses: bool
 
 
 def part_of(term: Term, values: FloatArray, beside: Beside) -> Part:
@@ -112,8 +114,8 @@ class AddedBody(Term):
 
 
 def _payload(term: Term, values: FloatArray, beside: Beside) -> Found:
-    if any(set(term.places) & set(m.places) and m.scope == "body" for m in beside.later):
-        return None  # what follows changes body and load together
+    if beside.fuses or any(set(term.places) & set(m.places) and m.scope == "body" for m in beside.later):
+        return None  # body and load become one, or what follows changes them together
     plain = beside.plain
     touching = {plain.body(int(b)).name for b in plain.geom_bodyid[(plain.geom_contype | plain.geom_conaffinity) != 0]}
     if touching & set(term.places):

@@ -44,12 +44,13 @@ class Target:
 def make_parts(robot: Robot, model: Model, numerics: Numerics) -> tuple[Part, ...]:
     """How a file holds each term that is not neutral; those of the robot itself come first."""
     everything = Model.joined([*((term, ()) for term in robot.always), *model.parts])
-    parts, plain = [], robot.compile()
+    parts, spec = [], robot.make_spec()
+    plain, fuses = robot.compile(), bool(spec.compiler.fusestatic)
     for i, (term, own) in enumerate(everything.parts):
         neutral = len(own) > 0 and np.array_equal(own, [p.nominal for p in term.parameters])
         if neutral and not type(term).overrides("edit_spec"):
             continue
-        parts.append(part_of(term, term.spread(own[None]), Beside(plain, numerics, everything.terms[i + 1 :])))
+        parts.append(part_of(term, term.spread(own[None]), Beside(plain, numerics, everything.terms[i + 1 :], fuses)))
     return tuple(parts)
 
 
