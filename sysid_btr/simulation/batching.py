@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
+from sysid_btr._typing import FloatArray, UInt8Array
 from sysid_btr.simulation.base_states import BaseStates, place_base
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.setup import write_terms
@@ -130,6 +130,8 @@ def _different(a: mujoco.MjModel, b: mujoco.MjModel) -> frozenset[str] | None:
     """Fields in which two models differ; None if they differ in what one batch cannot hold."""
     from mujoco.batch import MODEL_FIELDS
 
+    if np.array_equal(_content(a), _content(b)):
+        return frozenset()
     if not np.array_equal(_values(a.opt), _values(b.opt)) or a.names != b.names:
         return None
     found = set()
@@ -142,6 +144,15 @@ def _different(a: mujoco.MjModel, b: mujoco.MjModel) -> frozenset[str] | None:
                 return None
             found.add(name)
     return frozenset(found)
+
+
+def _content(model: mujoco.MjModel) -> UInt8Array:
+    """A model as MuJoCo writes it: compared a hundred times as fast as its fields."""
+    import mujoco
+
+    content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return content
 
 
 def _values(options: mujoco.MjOption) -> FloatArray:
