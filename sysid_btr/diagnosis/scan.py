@@ -309,7 +309,8 @@ def _judge(
 ) -> Sensitivity | None:
     """How much of a residual legal multiples of a response explain, which has these coordinates (k, directions)."""
     coefficients = residual.within.T @ coordinates
-    gram = response.T @ response - coefficients.T @ coefficients
+    with np.errstate(over="ignore", invalid="ignore"):  # of a replay that is about to diverge; not judged
+        gram = response.T @ response - coefficients.T @ coefficients
     # the residual is off the basis, so what the projection takes, here and from other subtrees, has no part in this
     inner = response.T @ residual.rest[rows]
     if not np.all(np.isfinite(gram)) or np.max(np.diag(gram)) <= residual.least:
