@@ -282,7 +282,12 @@ def inflated(study: Study, fitted: Fitted) -> tuple[Study, Fitted]:
 
 
 def _memory(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
-    """Integrated autocorrelation of each column's residual, by batch means over half-second stretches."""
+    """Samples that count as one independent sample in each column's residual, (columns,).
+
+    The larger of what its mean and what its size have: integrated autocorrelation by batch means over half-second
+    stretches, and integrated squared autocorrelation (Bartlett 1946, doi:10.2307/2983611). What swings about nothing
+    has no mean, however regular it is.
+    """
     columns, blocks = problem.column_labels, problem.blocks
     width = int(blocks.max()) + 1
     cell = columns * width + blocks
@@ -294,7 +299,21 @@ def _memory(problem: ReplayProblem, residual: FloatArray) -> FloatArray:
     live = np.bincount(np.arange(size) // width, count > 0, len(problem.columns))
     variance = square / np.maximum(problem.counts, 1)
     ratio: FloatArray = means / np.maximum(live, 1) / np.maximum(variance, 1e-300)
-    return np.maximum(ratio, 1.0)
+    order = np.argsort(columns, kind="stable")
+    series = np.split(np.nan_to_num(residual)[order], np.cumsum(np.bincount(columns))[:-1])
+    longest = problem.counts / np.maximum(live, 1)
+    swings = [_squared_autocorrelation(own, int(lags)) for own, lags in zip(series, longest, strict=True)]
+    return np.maximum(np.maximum(ratio, swings), 1.0)
+
+
+def _squared_autocorrelation(series: FloatArray, lags: int) -> float:
+    """Sum over so many lags of either sign of what squared autocorrelations have beyond those of white noise."""
+    n, power = len(series), float(series @ series)
+    if n < 2 or lags < 1 or not power > 0:
+        return 1.0
+    spectrum = np.abs(np.fft.rfft(series, 2 * n)) ** 2
+    rho = np.fft.irfft(spectrum)[1 : min(lags, n - 1) + 1] / power
+    return 1.0 + 2.0 * float(np.sum(rho**2 - 1.0 / n))
 
 
 def _by_cell(problem: ReplayProblem, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
