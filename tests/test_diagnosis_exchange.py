@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from test_diagnosis_selection import fitted, trial
 
-from sysid_btr.diagnosis.exchange import _at_fewer, _Part, _said_of_more
+from sysid_btr.diagnosis.exchange import _at_fewer, _Part, _said_of_more, preferred
 from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.selection import STANDARD
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.servo import Kp
+from sysid_btr.terms.spring import JointSpring
 
 COMMON = Kp(("hip", "knee", "ankle"), shared=True)
 
@@ -38,3 +43,15 @@ def test_without_a_term_for_all_places_are_what_they_are() -> None:
     effect = Kp(("hip", "knee"))
     alone = Model.of((CoulombFriction(("hip", "knee", "ankle"), shared=True), effect), [0.1, 1.25, 1.25])
     assert not _at_fewer(_Part(effect, effect.places), alone)
+
+
+@pytest.mark.parametrize(("chance", "replaced"), [(1.0, False), (0.05, True)])
+def test_what_has_more_numbers_takes_a_place_where_data_miss_them(chance: float, replaced: bool) -> None:
+    """By 10 % of chi2: of two samples that is chance, of 800 it is not."""
+    own = trial(CoulombFriction, fitted([5.5], chance=chance))
+    wider = trial(JointSpring, fitted([5.0], chance=chance))
+    numbers = np.arange(3.0)
+    wider = replace(
+        wider, fitted=replace(wider.fitted, model=Model.of((CoulombFriction(("hip",)), JointSpring(("hip",))), numbers))
+    )
+    assert preferred(STANDARD, [own, wider]) is (wider if replaced else own)

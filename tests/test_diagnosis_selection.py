@@ -297,7 +297,18 @@ def test_could_gain() -> None:
     first, now = fitted([1001.0]), fitted([4.0])
     assert could_gain(RULES, first, now)
     assert not could_gain(RULES, first, now, learnt=True)
-    assert not could_gain(RULES, first, fitted([1.5]))
+    # less allows a law that leaves nothing
+    assert could_gain(RULES, first, fitted([1.5]))
+    assert not could_gain(RULES, first, fitted([1.1]))
+
+
+def test_what_removes_all_that_is_left_is_no_trace_however_far_off_the_first_model_was() -> None:
+    first, now = fitted([1e6]), fitted([201.0])
+    assert has_minimum_gain(RULES, first, now, fitted([5.0]))
+    # what mends the shape of another effect leaves more
+    assert not has_minimum_gain(RULES, first, now, fitted([7.0]))
+    for may_fit_anything in ({"learnt": True}, {"transient": True}):
+        assert not has_minimum_gain(RULES, first, now, fitted([1.0]), **may_fit_anything)
 
 
 # --- locations and amounts ----------------------------------------------------------------------------------------
@@ -463,6 +474,9 @@ BEFORE = fitted([10.0])
         ([trial(SIMPLE, fitted([5.35])), trial(GENERAL, fitted([5.0], ahead=2.9))], 0),
         ([trial(SIMPLE, fitted([5.35])), trial(GENERAL, fitted([5.0], ahead=3.1))], 1),
         ([trial(SIMPLE, fitted([6.9])), trial(GENERAL, fitted([5.0], ahead=2.9))], 0),
+        # ... or far ahead, however little of the log tells the two apart
+        ([trial(SIMPLE, fitted([4.0])), trial(GENERAL, fitted([1.5], ahead=2.9))], 0),
+        ([trial(SIMPLE, fitted([4.2])), trial(GENERAL, fitted([1.5], ahead=2.9))], 1),
         ([trial(SIMPLE, fitted([5.35]), "hip"), trial(GENERAL, fitted([5.0]))], 1),
         ([trial(GENERAL, fitted([5.0])), trial(SIMPLE, fitted([5.25]))], 1),
         # ... but for another effect that is better beyond chance; a generalisation is none
@@ -484,8 +498,11 @@ def test_choose_the_simplest_of_the_best(trials: Sequence[Trial], winner: int | 
     ("lasting", "event", "winner"),
     [
         # misfit everywhere decides
-        (fitted([5.0], columns=[5.0]), fitted([10.0], [5.0], [4.6]), 1),
+        (fitted([5.0], columns=[8.0]), fitted([10.0], [5.0], [4.6]), 1),
         (fitted([5.0], columns=[5.0]), fitted([10.0], [5.0], [4.8]), 0),
+        # ... but for a law that explains half of the same: what happens once may follow it
+        (fitted([5.0], columns=[7.2]), fitted([10.0], [5.0], [4.6]), 0),
+        (fitted([5.0], columns=[7.4]), fitted([10.0], [5.0], [4.6]), 1),
         (fitted([10.0], columns=[5.0]), fitted([10.0], [5.0], [9.0]), 1),
         (fitted([10.0], columns=[5.0]), fitted([10.0], [8.0], [9.0]), None),
         (fitted([10.0], columns=[5.0]), fitted([10.6], [5.0], [9.0]), None),

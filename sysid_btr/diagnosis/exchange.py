@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import IntArray
-from sysid_btr.diagnosis.evidence import evidence_of, is_likely
+from sysid_btr.diagnosis.evidence import evidence_of, is_likely, is_missed
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, replacements
 from sysid_btr.diagnosis.selection import Selection
@@ -96,6 +96,8 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     hypotheses += [h for h in others if h.effect in FREE_FORMS]
     if part.whole:
         known = [h for h in state.evidence[at].alternatives if not _refines_a_law(h, model)]
+        # what happens once took second place to what lasts, and is added beside it where it is missed
+        known = [h for h in known if h.effect.transient <= part.effect.transient]
         hypotheses += [h for h in known if not _among(h, hypotheses)]
         hypotheses += [h for h in _at_fewer(part, model) if not _among(h, hypotheses)]
     rest = part.without(model, state)
@@ -162,9 +164,14 @@ def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:
 
 
 def preferred(rules: Selection, trials: Sequence[Trial]) -> Trial:
-    """The first of several trials, unless another predicts held-out data better, or as well and is simpler."""
+    """The first of several trials, unless another predicts held-out data better, or as well and is simpler.
+
+    One with more numbers must be missed: by more than these are worth.
+    """
     own = trials[0]
     near = near_best(rules, [t for t in trials if np.isfinite(t.fitted.holdout)])
     if own in near:
         near = [t for t in near if t is own or t.hypothesis.complexity < own.hypothesis.complexity]
-    return min(near, key=lambda t: (t.hypothesis.complexity, t is not own, t.fitted.misfit))
+    best = min(near, key=lambda t: (t.hypothesis.complexity, t is not own, t.fitted.misfit))
+    wider = best.hypothesis.complexity > own.hypothesis.complexity
+    return own if wider and not is_missed(rules, own.fitted, best.fitted) else best

@@ -258,14 +258,18 @@ def has_minimum_gain(
 ) -> bool:
     """Whether an effect removes more than a trace of what some column had above its floor at first.
 
-    `transient` says that it happens at some moment, `learnt` that its form is learnt; both beside others that are
-    named.
+    Or, where that was beyond all measure (what swings for ever without friction), all of what is left above the floor
+    of some column: what only mends the shape of another effect leaves more. `transient` says that it happens at some
+    moment, `learnt` that its form is learnt, which may fit anything; both beside others that are named.
     """
     if len(first.columns) != len(before.columns):
         return True
     least = max(rules.minimum_gain, rules.minimum_gain_transient * transient, (1 - rules.explained) * learnt)
-    excess = np.maximum(first.columns - 1, rules.least_excess)
-    return bool(np.nanmax((before.columns - after.columns) / excess) >= least)
+    gain, excess = before.columns - after.columns, np.maximum(first.columns - 1, rules.least_excess)
+    if np.nanmax(gain / excess) >= least:
+        return True
+    above = before.columns > column_limit(rules, before.chance)
+    return not (transient or learnt) and bool(np.any(above & (gain >= rules.explained * (before.columns - 1))))
 
 
 def could_gain(rules: Selection, first: Fitted, now: Fitted, *, transient: bool = False, learnt: bool = False) -> bool:

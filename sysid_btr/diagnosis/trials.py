@@ -131,9 +131,9 @@ def choose(rules: Selection, before: Fitted, trials: Sequence[Trial]) -> Trial |
     once = [t for t in trials if t.hypothesis.effect.transient and improves_once(rules, before, t.fitted)]
     if once:
         event = min(once, key=_misfit_everywhere)
-        others = [_misfit_everywhere(t) for t in lasting if not t.hypothesis.effect.transient]
-        if _misfit_everywhere(event) < min(others, default=np.inf) - rules.simpler:
-            return event
+        others = [t for t in lasting if not t.hypothesis.effect.transient]
+        if _misfit_everywhere(event) < min(map(_misfit_everywhere, others), default=np.inf) - rules.simpler:
+            return _lasting_first(rules, before, others, event)
     if lasting:
         return _law_first(rules, before, lasting, _simplest(rules, lasting))
     fitted = [t for t in trials if explains_fitted(rules, before, t.fitted)]
@@ -172,7 +172,8 @@ def near_best(rules: Selection, trials: Sequence[Trial]) -> list[Trial]:
 def _is_refined(rules: Selection, simple: Trial, best: Trial) -> bool:
     """Whether the best form of a family has more numbers than another at its locations, and beats it as chance may.
 
-    Curves have a rule of their own, see `has_law`.
+    Not what is far behind: where little of a log tells the two apart, chance may do anything. Curves have a rule of
+    their own, see `has_law`.
     """
     ours, theirs = simple.hypothesis, best.hypothesis
     return (
@@ -180,6 +181,7 @@ def _is_refined(rules: Selection, simple: Trial, best: Trial) -> bool:
         and family_of(ours.effect) == family_of(theirs.effect)
         and set(ours.places) == set(theirs.places)
         and ours.complexity < theirs.complexity
+        and simple.fitted.misfit <= best.fitted.misfit + rules.outdone
         and paired_t(best.fitted, simple.fitted) < rules.t
     )
 
@@ -192,6 +194,23 @@ def _law_first(rules: Selection, before: Fitted, trials: Sequence[Trial], winner
     gain = before.holdout - winner.fitted.holdout
     laws = [t for t in laws if before.holdout - t.fitted.holdout >= enough * gain]
     return _simplest(rules, laws) if laws else winner
+
+
+def _lasting_first(rules: Selection, before: Fitted, trials: Sequence[Trial], event: Trial) -> Trial:
+    """Instead of what happens once, a law at its place that explains a good part of the same: it may follow.
+
+    A push predicts nothing, and what a model lacks shows at some moment the most: where a drive is switched off, where
+    a motion is fast.
+    """
+    gain, places = _explained(before, event.fitted), set(event.hypothesis.places)
+    laws = [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
+    laws = [t for t in laws if _explained(before, t.fitted) >= rules.law * gain]
+    return _simplest(rules, laws) if laws else event
+
+
+def _explained(before: Fitted, after: Fitted) -> float:
+    """Decrease of the columns' chi2, of all data."""
+    return float((before.columns - after.columns).sum())
 
 
 def of_a_special_case(
