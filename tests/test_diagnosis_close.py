@@ -661,7 +661,11 @@ def test_a_real_axis_is_told_its_friction_by_laws_with_the_values_that_were_publ
     A curve over load would take up what a mass and a friction do together.
     """
     log = read_log(shared_data / "emps" / "emps.parquet")
-    found = close(make_study(load_robot("emps"), [log], threads=1), ["mass:*"])
+    library = [
+        *("coulomb_friction", "viscous_damping", "quadratic_damping", "stribeck_friction", "load_friction", "back_emf"),
+        *("constant_force", "joint_spring", "command_delay", "torque_scale", "free_torque", "free_friction"),
+    ]
+    found = close(make_study(load_robot("emps"), [log], threads=1), ["mass:*"], effects=library)
     published = {"mass": 1.0, "coulomb_friction": 20.4, "viscous_damping": 203.5, "constant_force": 3.16}
     estimates = {one.name.partition(":")[0]: one for one in found.estimates}
     assert {"coulomb_friction", "viscous_damping"} <= estimates.keys() <= published.keys()

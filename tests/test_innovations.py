@@ -132,7 +132,7 @@ def test_a_sample_is_predicted_from_what_was_before_it(monkeypatch: pytest.Monke
 
 @cache
 def walk(delay: float = 0.0) -> Log:
-    return record_walk(Gait(), 6.0, edit=heavier("LKneePitch", 1.4), delay=delay)[0]
+    return record_walk(Gait(), 4.6, edit=heavier("LKneePitch", 1.4), delay=delay)[0]
 
 
 @cache
