@@ -538,6 +538,16 @@ def test_the_torque_that_drives_is_not_compared_with_itself() -> None:
     assert [t.channel for t in comparison.targets] == ["position"]
 
 
+def test_a_range_in_radians_of_a_model_that_is_read_in_degrees_is_told_as_that() -> None:
+    log = moving(commands())
+    for width, told in ((1.5, False), (np.radians(1.5), True)):
+        ranges = dict.fromkeys(("shoulder", "elbow"), (-width, width))
+        remedies = [
+            p.remedy for p in validate_log(log, joints=tuple(ranges), ranges=ranges) if p.code == "units.degrees"
+        ]
+        assert [("<compiler" in remedy) for remedy in remedies] == [True] * told
+
+
 def test_of_two_channels_that_differ_like_degrees_the_range_of_the_joint_says_which_is_wrong() -> None:
     robot = arm(ACTUATORS["position"])
     log = moving(commands())

@@ -64,3 +64,27 @@ def test_a_stream_that_no_log_has_is_refused(tmp_path: Path, capsys: pytest.Capt
     asked = ["fit", "-m", str(leg / "leg.xml"), "-l", str(leg / "leg_clean.parquet"), "-f", "mass:*"]
     assert run([*asked, "--shift", "comand=1"]) == 2
     assert "did you mean command?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("late", "seed"), [(0.02, 0), (0.006, 1), (0.004, 2)])
+def test_a_velocity_that_lags_is_noted_with_its_lag_and_the_shift_mends_it(late: float, seed: int) -> None:
+    log, rng = swinging(0.0), np.random.default_rng(seed)
+    moving = np.interp(log.time - late, log.time, np.gradient(log.channels["position.knee"], 0.01))
+    noise = {"position.knee": 5e-4, "velocity.knee": 0.02}
+    channels = {**log.channels, "velocity.knee": moving + 0.01}  # a bias is no lag
+    channels = {n: c + noise.get(n, 0.0) * rng.normal(size=len(c)) for n, c in channels.items()}
+    log = replace(log, channels=channels)
+    (told,) = [p for p in validate_log(log) if p.code == "velocity.late"]
+    assert told.severity == "note"
+    found = -float(told.remedy.partition("velocity=")[2].split()[0])
+    assert found == pytest.approx(late, abs=0.001)
+    mended = shift_streams(log, {"velocity": -found})
+    assert not [p for p in validate_log(mended) if p.code == "velocity.late"]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.2, 57.3, -1.0, 0.0])
+def test_a_velocity_of_its_time_is_not_called_late_whatever_else_it_is(scale: float) -> None:
+    log, rng = swinging(0.0), np.random.default_rng(3)
+    moving = scale * np.gradient(log.channels["position.knee"], 0.01) + 0.02 * rng.normal(size=len(log))
+    log = replace(log, channels={**log.channels, "velocity.knee": moving})
+    assert not [p for p in validate_log(log) if p.code == "velocity.late"]

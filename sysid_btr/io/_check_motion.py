@@ -23,6 +23,16 @@ _UNRELATED = 0.3
 """Correlation with the command, at any lag, below which a position does not follow it. Positions of servos have 0.8 and
 more, of one that carries a heavy load or stands against a stop for half of the time about 0.5."""
 
+_STRETCH = 0.5  # s; what a velocity's offset adds up to must stay small
+_LEAST = 50
+"""Samples from which the lag of a velocity is looked for."""
+_TURNS = 4
+"""Times that it is found again, from the last one."""
+_SAMPLES, _LONGEST = 0.3, 0.2
+"""A lag that is worth a word, in samples, and the longest that is one, s."""
+_CLEAR = 0.25
+"""Of what the integral of a velocity leaves of the position without a lag: what it may leave with it."""
+
 
 def _threshold(log: Log, joint: str) -> float:
     """Motion worth the name: well above encoder ticks and friction's dead band."""
@@ -59,6 +69,7 @@ def check_motion(log: Log, tracking: Mapping[str, Tracking], kinds: Mapping[str,
     left = {j: t for j, t in tracking.items() if j not in explained and j not in flipped}
     yield from _late(log, left)
     yield from _unrelated(log, left)
+    yield from _late_velocities(log)
     yield from _dead(log, positions)
     yield from _clipped_sensors(log)
 
@@ -137,6 +148,50 @@ def _late(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:
             f"if they were started apart: --shift command={worst:.2f}; if the robot moves to each target over a set "
             "time, log the interpolated command instead",
         )
+
+
+def _late_velocities(log: Log) -> Iterator[Problem]:
+    """Velocities that lag behind their positions, as filters and backward differences do."""
+    lags = {joint: lag for joint in log.joints("velocity") if (lag := _lag_of_velocity(log, joint))}
+    if not lags:
+        return
+    typical = float(np.median([*lags.values()]))
+    yield Problem(
+        "velocity.late",
+        "note",
+        some(f"{joint} ({1e3 * lag:+.1f} ms)" for joint, lag in lags.items()),
+        f"the velocity lags {1e3 * typical:.1f} ms behind the position, as a filter or a backward difference does",
+        f"nothing where positions alone are fitted; --shift velocity={-typical:.4f} puts it right",
+    )
+
+
+def _lag_of_velocity(log: Log, joint: str) -> float:
+    """By how much a velocity comes later than its position moves, s; 0 where that is not clear.
+
+    What the integral of the velocity leaves of the position is, to first order, the lag times the velocity, beside a
+    constant in each stretch of time.
+    """
+    if not log.has("position", joint) or len(log.episodes()) > 1:
+        return 0.0
+    columns = np.stack([log.time, log.channels[f"position.{joint}"], log.channels[f"velocity.{joint}"]])
+    time, position, velocity = columns[:, np.isfinite(columns).all(axis=0)]
+    if len(time) < _LEAST or not (np.diff(time) > 0).all() or not np.ptp(position) > _threshold(log, joint):
+        return 0.0
+    stretch = np.unique(np.floor((time - time[0]) / _STRETCH), return_inverse=True)[1]
+    period, lag, left = float(np.median(np.diff(time))), 0.0, list[float]()
+    for _ in range(_TURNS):
+        moved = np.interp(time + lag, time, velocity)
+        moved = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (moved[1:] + moved[:-1]))])
+        off, speed = (x - _means(x, stretch) for x in (position - moved, velocity))
+        left.append(float(off @ off))
+        lag += float(off @ speed) / max(float(speed @ speed), 1e-300)
+    return lag if _SAMPLES * period < lag < _LONGEST and left[-1] < _CLEAR * left[0] else 0.0
+
+
+def _means(values: FloatArray, label: IntArray) -> FloatArray:
+    """(n,) mean of the values that share a label."""
+    total, count = np.bincount(label, values), np.bincount(label)
+    return np.asarray((total / np.maximum(count, 1))[label])
 
 
 def _unrelated(log: Log, tracking: Mapping[str, Tracking]) -> Iterator[Problem]:

@@ -16,6 +16,9 @@ from sysid_btr.io.problem import Problem
 DEGREES = 180 / math.pi
 TORQUES = 'commands that are torques: set "drive": "torque" in the metadata'
 """What to do about commands that are no positions, where the robot is not known."""
+NARROW = 0.1
+"""rad, range of a joint that is rather one in radians of a model that was read in degrees."""
+RADIANS = 'ranges of the model so narrow are rather radians read as degrees: <compiler angle="radian"/> in it'
 
 # Accepted spellings, the schema's own first; blanks, dots and ^ are ignored, case is not.
 _ALLOWED: Mapping[str, tuple[str, ...]] = {
@@ -177,7 +180,8 @@ def check_scale(
             f"{'these values look' if len(degrees) > 1 else 'the values look'} like degrees, not radians: {example}",
             f"multiply by pi/180 (check every joint of the channel); a joint that really turns so far: "
             f'set "units": {{"{column}": "rad"}} in the metadata'
-            + (f"; {TORQUES}" if column.startswith("command.") else ""),
+            + (f"; {TORQUES}" if column.startswith("command.") else "")
+            + (f"; {RADIANS}" if any(_is_narrow(ranges or {}, c.partition(".")[2]) for c in degrees) else ""),
         )
     if shrunk:
         yield Problem(
@@ -208,6 +212,11 @@ def check_scale(
     yield from _outside_range(log, ranges or {}, set(degrees) | set(milli))
     yield from _velocity_unit(log, set(degrees))
     yield from _acceleration_in_g(log)
+
+
+def _is_narrow(ranges: Mapping[str, tuple[float, float]], joint: str) -> bool:
+    """Whether a joint can hardly move, if the model's range is what it seems."""
+    return joint in ranges and max(map(abs, ranges[joint])) < NARROW
 
 
 def _degrees_by_magnitude(
