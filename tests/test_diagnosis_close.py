@@ -328,7 +328,7 @@ def test_of_several_bodies_the_one_that_will_do_alone_stays() -> None:
     """A cable at the body that carries the right one takes up a part of its pull, and by no small amount."""
     pull = (2.0, 5.0, -0.5, 0.3, 0.4, 0.03, 0.0, -0.05)
     study = make_study(toys.leg(), [recorded(Plant(Tether(KNEE), pull))], threads=1)
-    start = np.tile([1.0, 2.0, -0.5, 0.3, 0.4, 0.0, 0.0, 0.0], 2)
+    start = np.tile([1.5, 5.0, -0.5, 0.3, 0.4, 0.03, 0.0, -0.05], 2)
     both = Hypothesis(Tether, ("hip", "knee"), False, start, 0.0)
     trial = attempt(study, fit(study, TOY_FIT).model, both, STANDARD)
     tension = trial.fitted.model.own(trial.fitted.model.terms[-1])[::8]
