@@ -240,6 +240,20 @@ def test_derivatives_are_kept_where_they_foretell_what_a_step_does() -> None:
     np.testing.assert_array_equal(mended.start[~some], other.start[~some])
 
 
+def test_where_nothing_rubs_small_changes_to_one_side_give_the_derivatives_of_both() -> None:
+    episode = study().train[0]
+    assert isinstance(episode, InnovationsEpisode)
+    assert episode.chain is not None
+    chain = episode.chain.part(0, 40)
+    assert chain.steps.friction is None
+    values = Terms(chain.steps.terms).nominal
+    none = replace(chain, steps=replace(chain.steps, friction=np.zeros(len(chain.steps.index.dof))))
+    one, both = derive(chain, values), derive(none, values)
+    for name in ("start", "mean"):
+        side, middle = getattr(one, name), getattr(both, name)
+        assert np.linalg.norm(side - middle) < 0.02 * np.linalg.norm(middle)
+
+
 @pytest.mark.slow
 def test_masses_are_right_on_a_ground_that_the_model_does_not_know() -> None:
     walker = ground.draw(5)

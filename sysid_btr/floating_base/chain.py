@@ -69,6 +69,8 @@ that a joint which sticks or slips within it has the slope that serves both (sta
 et al. 2017, doi:10.1109/TAC.2016.2592681)."""
 NUDGE_FORCE, NUDGE_TORQUE = 5.0, 0.5
 """... and of forces, N, and torques, Nm."""
+SMALL = 0.1
+"""... where nothing sticks: fractions of these, so that what bends within them does not count."""
 STALE = 0.2
 """Error of a change of state that derivatives may predict, fractions of `NUDGE`."""
 NUDGE_NUMBER = 0.02
@@ -468,19 +470,26 @@ def _nudged_forces(chain: Chain) -> FloatArray:
 
 
 def _responses(chain: Chain, steps: SampleSteps, values: FloatArray, which: IntArray, up: FloatArray) -> FloatArray:
-    """(k, l, d) half the difference that changes `up` (k or 1, l, d + 6 f) and down make to the ends of some steps."""
-    half, wide = up.shape[1], np.broadcast_to(up, (len(which), *up.shape[1:]))
-    count = 2 * half
-    result = np.empty((len(which), half, chain.states.std.shape[1]))
+    """(k, l, d) what changes `up` (k or 1, l, d + 6 f) make to the ends of some steps.
+
+    Half the difference to what the opposite changes make, where joints stick and slip; elsewhere nothing is gained by
+    it, and a small part of the change, from the states as they are, tells the same.
+    """
+    size, smooth = up.shape[1], steps.friction is None
+    wide = np.broadcast_to(up, (len(which), *up.shape[1:]))
+    count = 1 + size if smooth else 2 * size
+    result = np.empty((len(which), size, chain.states.std.shape[1]))
     for first in range(0, len(which), TOGETHER):
         own = which[first : first + TOGETHER]
         segment, lane = np.repeat(own, count), np.tile(np.arange(count), len(own))
-        nudges = np.concatenate([wide[first : first + TOGETHER], -wide[first : first + TOGETHER]], axis=1)
-        nudges = nudges.reshape(len(segment), -1)
+        part = wide[first : first + TOGETHER]
+        others = np.zeros_like(part[:, :1]) if smooth else -part
+        nudges = np.concatenate([SMALL * part if smooth else part, others], axis=1).reshape(len(segment), -1)
         ends = steps.ends(values[None], np.zeros(len(segment), dtype=np.int64), segment, nudges)
-        raised = np.flatnonzero(lane < half)
-        change = difference(ends.chosen(raised), ends.chosen(raised + half))
-        result[first : first + TOGETHER] = 0.5 * change.reshape(len(own), half, -1)
+        raised = np.flatnonzero(lane < size)
+        beside = np.repeat(np.flatnonzero(lane == size), size) if smooth else raised + size
+        change = difference(ends.chosen(raised), ends.chosen(beside)) / (SMALL if smooth else 2.0)
+        result[first : first + TOGETHER] = change.reshape(len(own), size, -1)
     return result
 
 
