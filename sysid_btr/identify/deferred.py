@@ -29,6 +29,10 @@ LEAST_GAIN = 0.5
 """Decrease of the sum of squared residuals, in their mean square, for which a hypothesis, or a walk, is not simulated
 again."""
 
+ASTRAY = 0.01
+"""Decrease, a fraction of the loss, that a cheap integrator promises where the right one shows none, from which its
+derivatives lead astray."""
+
 
 @dataclass(frozen=True, eq=False)
 class Corrected(Derived):
@@ -85,7 +89,7 @@ def cheaper(problem: ReplayProblem, cheap: Numerics, values: FloatArray) -> Repl
 
     It does not where teeth meet.
     """
-    same = problem.terms.structural or cheap == problem.episodes[0].replay.numerics
+    same = problem.terms.rough or cheap == problem.episodes[0].replay.numerics
     return problem if same else corrected(problem, cheap, values)
 
 
@@ -114,7 +118,8 @@ def deferred_fit(
     -------
     FitResult
         If a `step` is given, with the right residuals at `x` and the cheap integrator's Jacobian. Converged once
-        another round lowers the right loss by less than `LEAST_GAIN`.
+        another round lowers the right loss by less than `LEAST_GAIN`; where one that promised much raises it, the
+        right integrator goes on alone.
     """
     bare = estimator.unconfirmed()
     near = corrected(problem, cheap, problem.start)
@@ -131,13 +136,21 @@ def deferred_fit(
         now = float(np.sum(there.right**2))
         evaluations += 2
         gain = (loss - now) / (now / len(there.offset))
+        if not gain >= 0 and loss - result.loss > ASTRAY * loss:
+            beside = replace(near, problem=problem, offset=np.zeros(len(near.offset)))
+            result = bare.fit(beside, rng=rng, budget=budget.after(evaluations), journal=journal, progress=progress)
+            return _linearised(beside, replace(result, evaluations=evaluations + result.evaluations), step)
         if gain >= 0:
             near, loss = there, now
         if not gain >= LEAST_GAIN:
             break
-    result = replace(result, x=near.start, loss=loss, evaluations=evaluations)
+    return _linearised(near, replace(result, x=near.start, loss=loss, evaluations=evaluations), step)
+
+
+def _linearised(near: Corrected, result: FitResult, step: float | None) -> FitResult:
+    """A result with residual and Jacobian of a problem at it, where a `step` is given to take the latter with."""
     if step is None:
         return result
-    residual, jacobian = linearise(near, near.start, step=step)
-    evaluations += 2 * len(near.start) + 1
+    residual, jacobian = linearise(near, result.x, step=step)
+    evaluations = result.evaluations + 2 * len(result.x) + 1
     return replace(result, evaluations=evaluations, jacobian=jacobian, residual=residual)

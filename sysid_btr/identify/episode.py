@@ -130,7 +130,7 @@ class Procedure:
 
     def stencil(self, terms: Terms) -> float:
         """Finite-difference step, fraction of a parameter's range: wide where the objective is rough."""
-        return ROUGH_STEP if terms.structural else LeastSquares.central_step
+        return ROUGH_STEP if terms.rough else LeastSquares.central_step
 
     def suited(self, estimator: E) -> E:
         """An estimator with settings that suit the objective."""

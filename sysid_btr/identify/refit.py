@@ -150,15 +150,15 @@ def _minimised(
         tolerance=1e-6 if polish else TOLERANCE,
         least_gain=LeastSquares.least_gain if polish else LEAST_GAIN,
     )
-    structural, step = model.terms.structural, study.stencil(model.terms)
+    rough, step = model.terms.rough, study.stencil(model.terms)
     estimator = study.procedure.suited(estimator)
-    if structural:
+    if rough:
         estimator = replace(estimator, forward_step=step, central_step=step)
     rng = np.random.default_rng(0)
     # of arrays too large for a journal only the latest is kept, and another fit may still need its own
     journal = Journal() if polish else study.section()
     # play makes the objective rough; of laws that fit badly the corrections take more than they save
-    costly = structural or model.terms.have_laws
+    costly = rough or model.terms.have_laws
     cheaper = study.procedure.deferred or not (polish or costly)
     if cheaper and study.numerics != study.cheap:
         result = deferred_fit(

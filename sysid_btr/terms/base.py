@@ -255,6 +255,9 @@ class Term:
     """What its places are where it is declared, if not that."""
     structural: ClassVar[bool] = False
     """Whether it adds joints to the model, which then has to be compiled for its places."""
+    rough: ClassVar[bool] = False
+    """Whether what a replay leaves is rough in its numbers, as where teeth meet: derivatives are then taken by wide
+    steps."""
     switches: ClassVar[bool] = False
     """Whether its law takes the torque of a drive away where the log's `enabled` is false."""
     law_acts: ClassVar[tuple[str, ...]] = ("servo", "friction", "limit")

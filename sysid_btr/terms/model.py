@@ -84,9 +84,9 @@ class Terms(tuple[Term, ...]):
             yield term, values[..., own]
 
     @property
-    def structural(self) -> bool:
-        """Whether any of them adds joints to the model."""
-        return any(term.structural for term in self)
+    def rough(self) -> bool:
+        """Whether any of them makes what a replay leaves rough in its numbers."""
+        return any(term.rough for term in self)
 
     def admit(self, kind: type[Term], places: Iterable[str]) -> bool:
         """Whether a further term may act at these places.

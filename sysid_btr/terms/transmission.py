@@ -48,6 +48,7 @@ class Backlash(Effect):
     variant: ClassVar[str] = "link"
     scope: ClassVar = "drive"
     structural: ClassVar[bool] = True
+    rough: ClassVar[bool] = True
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("play", "rad", 0.0, 0.0, 0.2, 0.004),
         Kind("softness", "rad/Nm", 0.0, 0.0, 0.02, 0.0005),
