@@ -97,7 +97,7 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     if part.whole:
         known = [h for h in state.evidence[at].alternatives if not _refines_a_law(h, model)]
         # what happens once took second place to what lasts, and is added beside it where it is missed
-        known = [h for h in known if h.effect.transient <= part.effect.transient]
+        known = [h for h in known if part.effect.transient or not h.effect.transient]
         hypotheses += [h for h in known if not _among(h, hypotheses)]
         hypotheses += [h for h in _at_fewer(part, model) if not _among(h, hypotheses)]
     rest = part.without(model, state)

@@ -89,7 +89,8 @@ class Selection:
     fraction of its gain. Time."""
     outdone: float = 1.0
     """Another law of an effect is not tried if the first one's misfit is so much beyond the best: e times chi2 in one
-    column. Nor is a hypothesis refitted to the end that is so far behind after its first iterations. Time."""
+    column. Nor is a hypothesis refitted to the end that is so far behind after its first iterations, nor taken for a
+    simpler form of the best. Time."""
     first_iterations: int = 1
     """Iterations of a refit after which it is compared with the best so far. Time."""
 
@@ -141,7 +142,8 @@ class Selection:
     Judgement."""
     law: float = 0.5
     """Fraction of what a curve that is learnt explains, from which a law at its place comes first: most of it. The law
-    says more, and a curve can still take up the rest. The same for a law and a special case of it. Judgement."""
+    says more, and a curve can still take up the rest. The same for a law and a special case of it, and for what happens
+    once and a law. Judgement."""
     law_if_periodic: float = 0.9
     """The same for a curve that is periodic in time and a law of its family, nearly all of it: pulses at its frequency
     explain 81 % of a sine, and what they leave asks for others beside. Judgement."""

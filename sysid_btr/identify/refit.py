@@ -44,8 +44,8 @@ class Fitted:
     model : terms and their values.
     train, holdout : mean square of error over noise floor.
     train_columns, holdout_columns, columns : the same for each log column: fitted, held-out, all data.
-    memory, holdout_memory : integrated autocorrelation, in samples, of each column's residual, fitted and held out; 1
-        if white.
+    memory, holdout_memory : samples that count as one independent sample in each column's residual, fitted and held
+        out; 1 if white.
     train_cells, holdout_cells : (columns, stretches) sums of squares over noise floor by stretch of half a
         second.
     train_counts, holdout_counts : (columns, stretches) number of samples.
