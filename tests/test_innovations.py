@@ -254,6 +254,16 @@ def test_where_nothing_rubs_small_changes_to_one_side_give_the_derivatives_of_bo
         assert np.linalg.norm(side - middle) < 0.02 * np.linalg.norm(middle)
 
 
+def test_where_a_law_may_make_joints_stick_derivatives_are_of_both_sides() -> None:
+    episode = study().train[0]
+    assert isinstance(episode, InnovationsEpisode)
+    assert episode.chain is not None
+    steps = episode.chain.steps
+    assert steps.smooth
+    sticking = study().declare(["stribeck_friction:LKneePitch"])
+    assert not replace(steps, terms=sticking).smooth
+
+
 @pytest.mark.slow
 def test_masses_are_right_on_a_ground_that_the_model_does_not_know() -> None:
     walker = ground.draw(5)

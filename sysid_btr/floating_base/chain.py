@@ -138,6 +138,11 @@ class SampleSteps(FloatingReplay):
         pushed[:, self.feet] = wrench
         return {"xfrc_applied": pushed}
 
+    @property
+    def smooth(self) -> bool:
+        """Whether no joint may stick and slip: nothing rubs, and no law acts, which may."""
+        return self.friction is None and not Terms(self.all_terms).have_laws
+
     @cached_property
     def still(self) -> BoolArray:
         """(w, j) whether a joint may stand still in a step: it begins or ends so slowly, or turns round."""
@@ -475,7 +480,7 @@ def _responses(chain: Chain, steps: SampleSteps, values: FloatArray, which: IntA
     Half the difference to what the opposite changes make, where joints stick and slip; elsewhere nothing is gained by
     it, and a small part of the change, from the states as they are, tells the same.
     """
-    size, smooth = up.shape[1], steps.friction is None
+    size, smooth = up.shape[1], steps.smooth
     wide = np.broadcast_to(up, (len(which), *up.shape[1:]))
     count = 1 + size if smooth else 2 * size
     result = np.empty((len(which), size, chain.states.std.shape[1]))
