@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -45,6 +46,7 @@ from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.inertial import GravityTilt
 from sysid_btr.terms.servo import CommandDelay
+from sysid_btr.testing.problems import ToyProblem
 
 FINE = Numerics("RK4", 0.001)
 WINDOWS = Mode("forward")
@@ -497,6 +499,33 @@ def test_a_fit_by_deferred_correction_is_that_of_the_right_integrator() -> None:
     assert np.abs(wrong - [1.3, 0.9]).max() > 5 * np.abs(found.x - [1.3, 0.9]).max()
     assert found.residual is not None
     assert found.residual == pytest.approx(problem.residuals(found.x[None])[0], abs=1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class Misled(ToyProblem):
+    """A problem whose cheap integrator says the opposite of what a parameter does."""
+
+    deviation = 0.0
+
+    def with_numerics(self, numerics: Numerics) -> Misled:
+        return replace(self, function=lambda x: -self.function(x))
+
+
+def test_where_cheap_derivatives_lead_astray_the_right_integrator_goes_on_alone() -> None:
+    around = np.array([-1.0, 0.0, 1.0])
+    problem = Misled(
+        names=("x",),
+        lower=np.full(1, -10.0),
+        upper=np.full(1, 10.0),
+        start=np.zeros(1),
+        function=lambda x: x - 3.0 + around,
+        optimum=np.full(1, 3.0),
+    )
+    settings = {"rng": np.random.default_rng(0), "budget": Budget(), "journal": Journal(), "progress": silent}
+    found = deferred_fit(cast(Any, problem), Numerics("implicitfast", 0.005), LeastSquares(), step=1e-3, **settings)
+    assert found.x == pytest.approx(problem.optimum, abs=1e-6)
+    assert found.residual == pytest.approx(around, abs=1e-6)
+    assert found.jacobian == pytest.approx(np.ones((3, 1)), abs=1e-6)
 
 
 def test_a_free_and_a_held_log_are_fitted_together() -> None:
