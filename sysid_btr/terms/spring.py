@@ -141,7 +141,7 @@ class JointStopBelow(JointStop):
 
 LEVER = 0.1
 """m, at which a pull makes a torque of the usual size."""
-NEAR, FAR = 0.4, 1.2
+NEAREST, NEAR, FAR = 0.1, 0.4, 1.2
 """m, to where a tether is held, from which a search begins."""
 STIFF = (0.5, 2.0, 8.0)
 """Stiffness, in tensions over the distance, likewise."""
@@ -192,19 +192,26 @@ class Tether(Effect):
 
     @classmethod
     def probes(cls, scale: JointScale) -> tuple[Probe, ...]:
-        """The same tension along each axis."""
+        """The same tension along each axis, and a spring to where the body is held at the reference."""
         pull = cls.sized(scale)[0].scale
-        return (tuple((pull, 0.0, *way, 0.0, 0.0, 0.0) for way in (FAR * np.eye(3)).tolist()),)
+        pulls = tuple((pull, 0.0, *way, 0.0, 0.0, 0.0) for way in (FAR * np.eye(3)).tolist())
+        return ((*pulls, (0.0, pull / NEAR, 0.0, 0.0, SHORTEST, 0.0, 0.0, 0.0)),)
 
     @classmethod
     def combine(cls, scale: JointScale, probe: Probe, amounts: FloatArray) -> FloatArray | None:
-        """The probe's directions are pulls: they add, whatever their signs."""
-        force = np.asarray(amounts, dtype=np.float64) * probe[0][0]
+        """The probe's directions are pulls, which add, whatever their signs, and how they turn and grow.
+
+        A spring without a length of its own, whose pull is a force at the reference, is held as far away as its
+        stiffness says.
+        """
+        *pulls, growth = np.asarray(amounts, dtype=np.float64)
+        force, stiffness = np.array(pulls) * probe[0][0], max(growth, 0.0) * probe[-1][1]
         tension = float(np.linalg.norm(force))
         if tension == 0:
             return None
-        most = cls.sized(scale)[0].upper
-        return np.array([min(tension, most), 0.0, *(FAR * force / tension), 0.0, 0.0, 0.0])
+        most, stiffest = (kind.upper for kind in cls.sized(scale)[:2])
+        far = max(tension / stiffness, NEAREST) if stiffness * FAR > tension else FAR
+        return np.array([min(tension, most), min(stiffness, stiffest), *(far * force / tension), 0.0, 0.0, 0.0])
 
     @classmethod
     def initial_guesses(cls, values: FloatArray) -> FloatArray:
