@@ -32,6 +32,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait
 from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.model import Model, Terms
 
 
@@ -252,6 +253,22 @@ def test_where_nothing_rubs_small_changes_to_one_side_give_the_derivatives_of_bo
     for name in ("start", "mean"):
         side, middle = getattr(one, name), getattr(both, name)
         assert np.linalg.norm(side - middle) < 0.02 * np.linalg.norm(middle)
+
+
+def test_predictions_are_right_to_a_thousandth_of_the_noise_and_derivatives_to_a_hundredth() -> None:
+    terms = study().declare(["mass:LKneePitch", "kp:*=shared"])
+    problem = study().with_initial_states(Model.of(terms)).train_problem(Model.of(terms))
+    nominal = Terms(terms).nominal
+    near = np.array([nominal, nominal * [1.3, 1.0], nominal * [1.0, 0.8]])
+
+    def residuals(numerics: Numerics) -> np.ndarray:
+        return problem.with_numerics(numerics).residuals(near)
+
+    right, ours, cheap = map(residuals, (Numerics("RK4", 0.001), study().numerics, study().cheap))
+    assert (study().numerics.timestep, study().cheap.timestep) == pytest.approx((0.005, 0.01))
+    assert np.sqrt(np.mean((ours - right) ** 2)) < 2e-3
+    change = right[1:] - right[0]
+    assert np.all(np.linalg.norm(cheap[1:] - cheap[0] - change, axis=1) < 0.02 * np.linalg.norm(change, axis=1))
 
 
 def test_where_a_law_may_make_joints_stick_derivatives_are_of_both_sides() -> None:

@@ -101,15 +101,17 @@ def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensit
     study, model = state.study, _scanned(state)
     problem, residual, jacobian = _linear(study, model, rules)
     asked = _perturbations(state, library, problem, residual)
+
+    def scanned(problem: ReplayProblem, residual: FloatArray, jacobian: FloatArray) -> list[Sensitivity]:
+        # what is left is the right integrator's; what an effect would change may be a little off
+        cheap = problem.with_numerics(study.cheap)
+        return scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
+
     if study.procedure.costly and len(asked) > rules.glance_most:
         glance = shorten(study, rules.glance_seconds).train_problem(model)
         linear = linearise(study.with_belief(glance), model.values, step=study.stencil(model.terms))
-        seen = scan(glance, model.values, *linear, asked, study.scales, rules)
-        asked = [s.perturbation for s in seen[: rules.glance_most]]
-    # what is left is the right integrator's; what an effect would change may be a little off
-    cheap = problem.with_numerics(study.cheap)
-    found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
-    return found, len(residual)
+        asked = [s.perturbation for s in scanned(glance, *linear)[: rules.glance_most]]
+    return scanned(problem, residual, jacobian), len(residual)
 
 
 def _scanned(state: State) -> Model:
