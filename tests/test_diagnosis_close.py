@@ -15,7 +15,7 @@ import toys
 
 from sysid_btr.diagnosis.close import close
 from sysid_btr.diagnosis.closing import Closing, NamedEffect
-from sysid_btr.diagnosis.elimination import eliminate, without_dispensable
+from sysid_btr.diagnosis.elimination import _pruned, eliminate, without_dispensable
 from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
@@ -29,7 +29,7 @@ from sysid_btr.errors import LogError
 from sysid_btr.estimators import Journal
 from sysid_btr.estimators.base import silent
 from sysid_btr.identify.fit import fit
-from sysid_btr.identify.refit import judge
+from sysid_btr.identify.refit import judge, refit
 from sysid_btr.identify.replay import replay_log
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log
@@ -37,7 +37,7 @@ from sysid_btr.io.parquet import read_log
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
-from sysid_btr.terms.disturbance import ConstantForce, RingingDisturbance, RingingDisturbanceTrain
+from sysid_btr.terms.disturbance import ConstantForce, ExternalDisturbance, RingingDisturbance, RingingDisturbanceTrain
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FreeTorquePeriodic, FreeTorquePosition
 from sysid_btr.terms.friction import (
@@ -322,6 +322,18 @@ def test_a_tether_is_named_where_bodies_are_not_called_as_their_joints_and_its_p
     effect = only_effect(found)
     assert (found.verdict, effect.effect, effect.where) == ("explained", "tether", ("ankle_link",))
     assert amount_is(effect, 0, 2.9), effect
+
+
+def test_where_a_band_is_held_shows_in_how_its_pull_grows_before_it_is_fitted() -> None:
+    """One without a length of its own: its pull is a force where the joints are at their reference, and a spring."""
+    stiffness, to = 2.0, np.array([0.3, 0.1, -0.2])
+    pull = (stiffness * float(np.linalg.norm(to)), stiffness, *to, 0.0, 0.0, 0.0)
+    study = make_study(toys.leg(), [recorded(Plant(Tether(("ankle",)), pull))], threads=1)
+    state = State.of(fit(study, TOY_FIT), None)
+    first, *_ = leading_hypotheses(state, (Tether,), STANDARD)[0]
+    assert first.places == ("ankle",)
+    np.testing.assert_allclose(first.start[:2], pull[:2], rtol=0.35)
+    assert np.linalg.norm(first.start[2:5] - to) < 0.35 * np.linalg.norm(to)
 
 
 def test_of_several_bodies_the_one_that_will_do_alone_stays() -> None:
@@ -642,6 +654,27 @@ def test_a_hypothesis_that_is_too_fast_for_the_step_is_tried_with_a_shorter_one(
     found = attempt(coarse, plain.model, soft, Selection()).fitted
     assert np.isfinite(found.holdout)
     assert found.numerics.timestep < 0.02
+
+
+def test_what_was_added_last_goes_if_the_others_have_come_to_do_without_it() -> None:
+    """A push takes up what a fit of friction that stood far off had left."""
+    plant = Plant(CoulombFriction(KNEE), (0.15,))
+    study = make_study(toys.leg(), [recorded(plant)], threads=1)
+    state = State.of(fit(study, TOY_FIT), None)
+    rubs, pushed = CoulombFriction.at(KNEE, study.scales), ExternalDisturbance.at(KNEE, study.scales)
+    model = refit(study, state.fitted.model.with_(rubs, np.array([0.1]))).model
+    both = judge(study, model.with_(pushed, np.array([0.002, 1.0, 0.3])))
+    state = replace(state, fitted=both, evidence=(Evidence(), Evidence()))
+    (effect,) = _pruned(state, STANDARD).effects
+    assert (effect.name, effect.places) == ("coulomb_friction", KNEE)
+    # a push that the log shows stays, although held-out data have none
+    plant = Plant(ExternalDisturbance(KNEE), (0.5, 1.0, 0.2))
+    study = make_study(toys.leg(), [recorded(plant)], threads=1)
+    state = State.of(fit(study, TOY_FIT), None)
+    model = state.fitted.model.with_(rubs, np.array([0.0])).with_(pushed, np.array([0.5, 1.0, 0.2]))
+    state = replace(state, fitted=refit(study, model), evidence=(Evidence(), Evidence()))
+    (effect,) = _pruned(state, STANDARD).effects
+    assert (effect.name, effect.places) == ("external_disturbance", KNEE)
 
 
 def test_friction_that_falls_with_speed_by_nothing_is_dry_friction() -> None:

@@ -19,6 +19,7 @@ from sysid_btr.diagnosis.selection import (
     agree,
     distance_from_nothing,
     doubtful_location,
+    improves_once,
     is_needed,
     is_small,
 )
@@ -126,14 +127,18 @@ def _at_one_body(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, i
 
 
 def _pruned(state: State, rules: Selection) -> State:
-    """The state without effects, and then locations of effects, in demand only until a later effect was found."""
+    """The state without effects, and then locations of effects, in demand only until a later effect was found.
+
+    The last one too: with it others may have come to values at which it is not missed.
+    """
     removed: list[str] = []
     found = state.effects if len(state.effects) > 1 else ()
-    for effect in found[:-1]:
+    for effect in found:
         short, rest = shorten(state.study, rules.refit_seconds), state.fitted.model.without(effect)
         trial = refit(short, rest, judged=state.study)
         state = state.spent(trial.evaluations)
-        if not is_needed(rules, trial, state.fitted):
+        once = effect.transient and improves_once(rules, trial, state.fitted)
+        if not (once or is_needed(rules, trial, state.fitted)):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
             state = replace(state, fitted=trial, evidence=state.without_evidence_of(effect))
     for effect in state.effects if found else ():

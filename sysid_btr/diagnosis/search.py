@@ -52,10 +52,10 @@ ROUND_SHARE = 0.35
 def search(state: State, library: Library, rules: Selection, progress: Progress) -> State:
     """Add effects one at a time until nothing is left to explain, or nothing helps.
 
-    Where errors of the model grow in a replay, what is left by a form that is not quite right grows too, and much would
-    take it up. There nothing joins effects that explain the log already unless it is likely to be what it is called.
-    Beside fewer, one that is not may become so once another is known; where the next is not likely either, both go
-    (early stopping with patience: Prechelt 1998, doi:10.1007/3-540-49430-8_3).
+    What a form that is not quite right leaves, much would take up: nothing joins effects that explain the log already
+    unless it is likely to be what it is called. Where errors of the model grow in a replay, what such a form leaves
+    grows too. There an effect beside fewer that is not likely may become so once another is known; where the next is
+    not likely either, both go (early stopping with patience: Prechelt 1998, doi:10.1007/3-540-49430-8_3).
     """
     sure, doubtful = state, list[Hypothesis]()
     for number in range(1, rules.rounds + 1):
@@ -85,9 +85,9 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             state, winner, trials = _simplified(state, winner, trials, library, rules)
         floating = state.study.procedure.leaves_ground_error
         explained = bool(state.effects) and is_log_explained(rules, state.before, now, floating=floating)
-        likely = _is_likely(state, winner, trials, rules)
-        if explained and not likely:
+        if explained and winner is not None and not is_likely(rules, now, winner, trials):
             winner = None
+        likely = _is_likely(state, winner, trials, rules)
         told = candidates_of(rules, now, trials, winner, number)
         state = replace(state, candidates=(*state.candidates, *told))
         if winner is None:

@@ -129,8 +129,8 @@ class Selection:
     it is added: it must be the more likely of the two."""
 
     likely: float = 0.5
-    """Certainty of its name from which one more is added to effects that explain the log already (`explained`), where
-    errors grow in a replay: it must be more likely right than not."""
+    """Certainty of its name from which one more is added to effects that explain the log already (`explained`): it must
+    be more likely right than not."""
     patience: int = 2
     """Effects in turn that are added without being so likely, beside one that is, after which these go again. One may
     wait for another that acts where it does. Judgement."""
