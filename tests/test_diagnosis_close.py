@@ -25,6 +25,8 @@ from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import attempt
+from sysid_btr.diagnosis.uncertainty import with_intervals
+from sysid_btr.diagnosis.verdict import named_effects
 from sysid_btr.errors import LogError
 from sysid_btr.estimators import Journal
 from sysid_btr.estimators.base import silent
@@ -675,6 +677,21 @@ def test_what_was_added_last_goes_if_the_others_have_come_to_do_without_it() -> 
     state = replace(state, fitted=refit(study, model), evidence=(Evidence(), Evidence()))
     (effect,) = _pruned(state, STANDARD).effects
     assert (effect.name, effect.places) == ("external_disturbance", KNEE)
+
+
+def test_what_others_can_take_up_is_not_said_to_be_explained() -> None:
+    """Without a second delay the first leaves much as it is, and nothing once it has grown."""
+    study = make_study(toys.leg(), [recorded(Plant(CommandDelay(KNEE), (0.025,)))], threads=1)
+    model = fit(study, TOY_FIT).model
+    for kind in (CommandDelay, SensorDelay):
+        model = model.with_(kind.at(KNEE, study.scales), np.array([0.0125]))
+    state = replace(State.of(fit(study, TOY_FIT), None), fitted=judge(study, model), evidence=(Evidence(), Evidence()))
+    bare = judge(study, model.without(model.terms[-1]))
+    assert bare.holdout - 1 > 3 * (state.fitted.holdout - 1)
+    (_, second), spent = named_effects(with_intervals(state, STANDARD), STANDARD)
+    assert second.explains["holdout"] < 0.1
+    assert not second.likely
+    assert spent > 0
 
 
 def test_friction_that_falls_with_speed_by_nothing_is_dry_friction() -> None:

@@ -93,7 +93,8 @@ def close(
         with phase("elimination", 0.8):
             state = with_discrepancy(eliminate(state, library, selection, progress))
         floating = state.study.procedure.leaves_ground_error
-        named = named_effects(state, selection)
+        named, spent = named_effects(state, selection)
+        state = state.spent(spent)
         verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)
         short = verdict in ("unexplained", "partly_explained")
         later = later_split(state.study, state.fitted, selection) if short else None

@@ -31,9 +31,10 @@ class NamedEffect:
     parameters : how large, with intervals.
     certainty : probability that a cause of this family acts there, see `sysid_btr.diagnosis.certainty`.
     otherwise : probabilities of other families, the likeliest first.
-    explains : share of the error above the noise floor (squared) that vanishes with it, ``train`` and ``holdout``.
+    explains : share of the error above the noise floor (squared) that vanishes with it, ``train`` and ``holdout``, of
+        what is left without it once all others are fitted again.
     provisional : whether something is left where it acts, so that its form, or it, may be another.
-    gain_holdout : fraction of the held-out chi2 that vanishes with it.
+    gain_holdout : fraction of the held-out chi2 that vanishes with it, likewise.
     confused_with : effects with which it is confounded on this log.
     sentence : the finding in words.
     evidence : what the certainty rests on, by name.

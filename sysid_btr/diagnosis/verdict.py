@@ -12,7 +12,7 @@ from sysid_btr.diagnosis.selection import Selection, differs_from, is_log_explai
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
 from sysid_btr.identify.intervals import Estimate
-from sysid_btr.identify.refit import Fitted, judge
+from sysid_btr.identify.refit import Fitted, judge, refit, shorten
 from sysid_btr.identify.scores import score
 from sysid_btr.models.robot import channel_units
 from sysid_btr.terms.effect import Effect, family_of
@@ -70,17 +70,18 @@ def conclude(state: State, verdict: Verdict, named: Sequence[NamedEffect], rules
     )
 
 
-def named_effects(state: State, rules: Selection) -> tuple[NamedEffect, ...]:
-    """Every effect with its parameters, how sure it is, what data lose without it, and what it may be confused with."""
-    model = state.fitted.model
-    result = []
+def named_effects(state: State, rules: Selection) -> tuple[tuple[NamedEffect, ...], int]:
+    """Every effect with its parameters, how sure it is, what data lose without it, and what it may be confused with.
+
+    Beside these how many replays that took: what data lose is what is left once all others have done what they can.
+    """
+    model, study, spent = state.fitted.model, state.study, 0
+    short, result = shorten(study, rules.refit_seconds), []
     for effect, evidence in zip(state.effects, state.evidence, strict=True):
-        columns = model.terms.columns(effect)
-        without = model.values.copy()
-        without[columns] = effect.neutral
-        off = judge(state.study, model.at(without))
-        result.append(_named(effect, state.estimates[columns], evidence, off, state, rules))
-    return tuple(result)
+        off = refit(short, model.without(effect), judged=study)
+        spent += off.evaluations
+        result.append(_named(effect, state.estimates[model.terms.columns(effect)], evidence, off, state, rules))
+    return tuple(result), spent
 
 
 def _named(
