@@ -19,7 +19,6 @@ from sysid_btr.diagnosis.selection import (
     agree,
     distance_from_nothing,
     doubtful_location,
-    improves_once,
     is_needed,
     is_small,
 )
@@ -28,7 +27,7 @@ from sysid_btr.diagnosis.trials import Trial, attempt, is_wanted
 from sysid_btr.diagnosis.uncertainty import with_intervals
 from sysid_btr.estimators.base import Progress, without_loss
 from sysid_btr.estimators.linearisation import linearise
-from sysid_btr.identify.refit import Fitted, inflate, refit, shorten
+from sysid_btr.identify.refit import Fitted, inflate, refit
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import covariance
 from sysid_btr.terms.effect import Effect
@@ -134,11 +133,9 @@ def _pruned(state: State, rules: Selection) -> State:
     removed: list[str] = []
     found = state.effects if len(state.effects) > 1 else ()
     for effect in found:
-        short, rest = shorten(state.study, rules.refit_seconds), state.fitted.model.without(effect)
-        trial = refit(short, rest, judged=state.study)
+        trial = state.refitted_without(effect, rules.refit_seconds)
         state = state.spent(trial.evaluations)
-        once = effect.transient and improves_once(rules, trial, state.fitted)
-        if not (once or is_needed(rules, trial, state.fitted)):
+        if not is_needed(rules, trial, state.fitted, transient=effect.transient):
             removed.append(f"{effect.name} at {', '.join(effect.places)}")
             state = replace(state, fitted=trial, evidence=state.without_evidence_of(effect))
     for effect in state.effects if found else ():

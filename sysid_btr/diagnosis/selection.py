@@ -304,9 +304,16 @@ def explains_fitted(rules: Selection, before: Fitted, after: Fitted) -> bool:
     return bool(np.any(whole)) and after.holdout < (1 + rules.whole_harm) * before.holdout
 
 
-def is_needed(rules: Selection, without: Fitted, now: Fitted) -> bool:
-    """Whether data are predicted worse without an effect, by what it takes to add one."""
-    return improves(rules, without, now) or explains_fitted(rules, without, now)
+def is_needed(rules: Selection, without: Fitted, now: Fitted, *, transient: bool = False) -> bool:
+    """Whether data are predicted worse without an effect, by any of the ways in which one is added.
+
+    `transient` says that it happens at some moment, of which held-out data may hold nothing.
+    """
+    return (
+        improves(rules, without, now)
+        or explains_fitted(rules, without, now)
+        or (transient and improves_once(rules, without, now))
+    )
 
 
 # --- locations and amounts ----------------------------------------------------------------------------------------

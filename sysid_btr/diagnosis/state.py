@@ -10,7 +10,7 @@ from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.identify.fit import Fit
 from sysid_btr.identify.intervals import Estimate
-from sysid_btr.identify.refit import Fitted, inflated, judge
+from sysid_btr.identify.refit import Fitted, inflated, judge, refit, shorten
 from sysid_btr.identify.step_check import longest_step
 from sysid_btr.identify.study import Study
 from sysid_btr.simulation.numerics import Numerics
@@ -84,6 +84,10 @@ class State:
             return self
         study = replace(self.study, numerics=numerics)
         return replace(self, study=study, fitted=judge(study, self.fitted.model)).spent(1)
+
+    def refitted_without(self, effect: Effect, seconds: float) -> Fitted:
+        """What all others come to without an effect, fitted again to so many seconds of each log."""
+        return refit(shorten(self.study, seconds), self.fitted.model.without(effect), judged=self.study)
 
     def spent(self, replays: int) -> State:
         """The same after more simulations."""

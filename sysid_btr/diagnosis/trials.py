@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr.diagnosis.closing import Candidate
 from sysid_btr.diagnosis.hypotheses import Hypothesis
-from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once
+from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once, is_needed
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import Effect, family_of
@@ -320,9 +320,4 @@ def fate(rules: Selection, before: Fitted, trial: Trial, winner: Trial | None) -
 
 def is_wanted(rules: Selection, before: Fitted, trial: Trial) -> bool:
     """Whether any of the ways to be added is open to a trial."""
-    fitted, once = trial.fitted, trial.hypothesis.effect.transient
-    return (
-        improves(rules, before, fitted)
-        or explains_fitted(rules, before, fitted)
-        or (once and improves_once(rules, before, fitted))
-    )
+    return is_needed(rules, before, trial.fitted, transient=trial.hypothesis.effect.transient)

@@ -12,7 +12,7 @@ from sysid_btr.diagnosis.selection import Selection, differs_from, is_log_explai
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
 from sysid_btr.identify.intervals import Estimate
-from sysid_btr.identify.refit import Fitted, judge, refit, shorten
+from sysid_btr.identify.refit import Fitted, judge
 from sysid_btr.identify.scores import score
 from sysid_btr.models.robot import channel_units
 from sysid_btr.terms.effect import Effect, family_of
@@ -75,12 +75,12 @@ def named_effects(state: State, rules: Selection) -> tuple[tuple[NamedEffect, ..
 
     Beside these how many replays that took: what data lose is what is left once all others have done what they can.
     """
-    model, study, spent = state.fitted.model, state.study, 0
-    short, result = shorten(study, rules.refit_seconds), []
+    result, spent = [], 0
     for effect, evidence in zip(state.effects, state.evidence, strict=True):
-        off = refit(short, model.without(effect), judged=study)
+        off = state.refitted_without(effect, rules.refit_seconds)
         spent += off.evaluations
-        result.append(_named(effect, state.estimates[model.terms.columns(effect)], evidence, off, state, rules))
+        own = state.estimates[state.fitted.model.terms.columns(effect)]
+        result.append(_named(effect, own, evidence, off, state, rules))
     return tuple(result), spent
 
 

@@ -515,11 +515,11 @@ def with_friction(chain: Chain, values: FloatArray) -> Chain:
 
 def _roughly(chain: Chain) -> SampleSteps:
     """Steps of a sample with the longest steps of the fourth-order integrator that divide it."""
-    step = longest_step(float(chain.time[1]), chain.size)
+    step = derivative_step(float(chain.time[1]), chain.size)
     return replace(chain.steps, numerics=replace(chain.steps.numerics, integrator="RK4", timestep=step))
 
 
-def longest_step(period: float, size: BodySize) -> float:
+def derivative_step(period: float, size: BodySize) -> float:
     """The longest step, s, for derivatives that divides the period of samples of a robot of some size."""
     return whole_step(period, size.time(LONGEST))
 

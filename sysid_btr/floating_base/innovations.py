@@ -32,12 +32,12 @@ from sysid_btr.floating_base.chain import (
     acting,
     chain_of,
     chainable,
+    derivative_step,
     derive,
     difference,
     each_of,
     likeliest,
     linearise_chain,
-    longest_step,
     measurements,
     moved_chain,
     remembers,
@@ -501,7 +501,7 @@ class InnovationsEpisode(Episode):
 
     def choose_numerics(self, threads: int = 0, simulator: str = MUJOCO) -> tuple[Numerics, float]:
         """Half the longest step for derivatives: from sample to sample nothing happens that needs a finer one."""
-        step = longest_step(float(np.median(np.diff(self.log.time))), self.base.size)
+        step = derivative_step(float(np.median(np.diff(self.log.time))), self.base.size)
         return Numerics("RK4", step, simulator=simulator).halved(), 0.0
 
     def facts(self) -> Mapping[str, Any]:
