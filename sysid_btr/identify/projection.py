@@ -15,8 +15,10 @@ def explained_by(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
 
 def orthonormal(jacobian: FloatArray) -> FloatArray:
     """Orthonormal basis (r, k) of what parameters with these derivatives (r, p) can do."""
-    norm = np.linalg.norm(jacobian, axis=0)
-    live = jacobian[:, norm > 0] / norm[norm > 0]
+    # derivatives of what is about to diverge are finite, and their squares are not
+    largest = np.abs(jacobian).max(axis=0, initial=0.0)
+    live = jacobian[:, largest > 0] / largest[largest > 0]
+    live /= np.linalg.norm(live, axis=0)
     if live.shape[1] == 0:
         return np.zeros((len(jacobian), 0))
     u, s, _ = np.linalg.svd(live, full_matrices=False)
