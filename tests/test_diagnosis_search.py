@@ -17,6 +17,7 @@ from sysid_btr.diagnosis import search as module
 from sysid_btr.diagnosis.evidence import Evidence
 from sysid_btr.diagnosis.exchange import exchange
 from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.leads import Library
 from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
 from sysid_btr.diagnosis.state import State
@@ -30,9 +31,10 @@ from sysid_btr.identify.study import Study, make_study
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionPower, QuadraticDamping, ViscousDamping
+from sysid_btr.terms.inertial import Armature
 from sysid_btr.terms.model import Model
 
-ORDER: tuple[type[Effect], ...] = (CoulombFriction, ViscousDamping, QuadraticDamping)
+ORDER: tuple[type[Effect], ...] = (CoulombFriction, ViscousDamping, QuadraticDamping, Armature)
 
 
 @cache
@@ -44,13 +46,14 @@ def begun() -> State:
 def found(likely: Sequence[bool], monkeypatch: pytest.MonkeyPatch, rules: Selection = STANDARD) -> State:
     """A search whose rounds each add the next effect, which is likely or not, and which then ends."""
 
-    def try_next(state: State, library: object, rules: object, say: object) -> tuple[State, list[Trial]]:
-        k = len(state.effects)
-        if k == len(likely):
+    def try_next(state: State, library: Library, rules: object, say: object) -> tuple[State, list[Trial]]:
+        known = {type(effect) for effect in state.effects}
+        kind = next((e for e in library if e not in known), None)
+        if kind is None:
             return state, []
         now = state.fitted
         better = replace(now, holdout_columns=0.8 * now.holdout_columns, holdout=0.8 * now.holdout)
-        return state, [Trial(Hypothesis(ORDER[k], ("elbow",), False, np.array([0.1]), 1.0), better)]
+        return state, [Trial(Hypothesis(kind, ("elbow",), False, np.array([0.1]), 1.0), better)]
 
     def add(state: State, winner: Trial, trials: object, rules: object) -> State:
         term = winner.hypothesis.term(state.study.scales)
@@ -66,7 +69,7 @@ def found(likely: Sequence[bool], monkeypatch: pytest.MonkeyPatch, rules: Select
     monkeypatch.setattr(module, "choose", lambda rules, now, trials: trials[0] if trials else None)
     monkeypatch.setattr(module, "_add", add)
     monkeypatch.setattr(module, "is_likely", is_likely)
-    return search(begun(), ORDER, rules, silent)
+    return search(begun(), ORDER[: len(likely)], rules, silent)
 
 
 @pytest.mark.parametrize(
@@ -88,6 +91,22 @@ def test_effects_whose_names_are_not_likely_go_where_two_are_added_in_turn(
     assert list(state.steps[-1].removed) == gone
     assert sum(len(step.added) for step in state.steps) == len(likely)
     assert len(state.evidence) == kept
+
+
+def test_the_search_goes_on_without_what_went(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = found([True, False, False, True], monkeypatch)
+    assert [type(e) for e in state.effects] == [ORDER[0], ORDER[3]]
+    assert [step.removed for step in state.steps if step.removed] == [
+        tuple(str(Hypothesis(e, ("elbow",), False, np.zeros(1), 0.0)) for e in ORDER[1:3])
+    ]
+    assert len(state.evidence) == 2
+
+
+def test_it_does_not_go_on_where_it_may_not_or_little_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    likely = [True, False, False, True]
+    assert [type(e) for e in found(likely, monkeypatch, Selection(detours=0)).effects] == [ORDER[0]]
+    monkeypatch.setattr(module, "something_left", lambda *_: False)
+    assert [type(e) for e in found(likely, monkeypatch).effects] == [ORDER[0]]
 
 
 def test_patience_says_how_many(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,6 +20,7 @@ from sysid_btr.diagnosis.selection import (
     has_minimum_gain,
     improves,
     is_log_explained,
+    something_left,
 )
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import (
@@ -55,7 +56,8 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
     What a form that is not quite right leaves, much would take up: nothing joins effects that explain the log already
     unless it is likely to be what it is called. Where errors of the model grow in a replay, what such a form leaves
     grows too. There an effect beside fewer that is not likely may become so once another is known; where the next is
-    not likely either, both go (early stopping with patience: Prechelt 1998, doi:10.1007/3-540-49430-8_3).
+    not likely either, both go (early stopping with patience: Prechelt 1998, doi:10.1007/3-540-49430-8_3). Where much is
+    left, the search goes on without them, so many times (limited discrepancy search: Harvey and Ginsberg 1995).
     """
     sure, doubtful = state, list[Hypothesis]()
     for number in range(1, rules.rounds + 1):
@@ -97,7 +99,11 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
         sure = state if likely else sure
         if sure.effects and len(doubtful) == rules.patience:
             sure = replace(sure, candidates=state.candidates, replays=state.replays, steps=state.steps)
-            return sure.step(removed=[str(h) for h in doubtful])
+            sure = sure.step(removed=[str(h) for h in doubtful])
+            if not rules.detours or not something_left(rules, sure.before, sure.fitted):
+                return sure
+            others = tuple(effect for effect in library if effect not in {h.effect for h in doubtful})
+            return search(sure, others, replace(rules, detours=rules.detours - 1), progress)
     return state
 
 

@@ -134,6 +134,8 @@ class Selection:
     patience: int = 2
     """Effects in turn that are added without being so likely, beside one that is, after which these go again. One may
     wait for another that acts where it does. Judgement."""
+    detours: int = 1
+    """Times that the search then goes on from where it was sure, without them, if much is left (`rest`). Time."""
 
     # --- which one of several ---
 
