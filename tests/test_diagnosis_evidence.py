@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 
 from sysid_btr.diagnosis.certainty import STANDARD
 from sysid_btr.diagnosis.evidence import (
+    Evidence,
     evidence_of,
     is_missed,
     left_where_it_acts,
@@ -20,7 +23,10 @@ from sysid_btr.diagnosis.evidence import (
 )
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import STANDARD as RULES
+from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial
+from sysid_btr.diagnosis.verdict import named_effects
+from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ConstantForce
@@ -66,6 +72,30 @@ def test_a_cause_of_no_size_is_not_more_likely_than_not() -> None:
     assert STANDARD.certainty(known, sized=False) == 0.5
     doubtful = known | {"left": 0.9}
     assert STANDARD.certainty(doubtful, sized=False) == STANDARD.certainty(doubtful) < 0.5
+
+
+class Known(State):
+    """A diagnosis at its end, in which all others leave a hundred times the noise without an effect."""
+
+    def refitted_without(self, effect: Effect, seconds: float) -> Fitted:
+        return left(even(100.0))
+
+
+def told(*effects: CoulombFriction) -> list[float]:
+    """How sure names are of which the log does not tell the size."""
+    model = Model.joined((effect, np.array([0.1])) for effect in effects)
+    nothing: Any = SimpleNamespace(model=Model.of(()))
+    now = replace(left(even(1.1)), model=model)
+    size = Estimate("size", "Nm", 0.0, 0.1, 1.0, (-1.9, 2.1), (0.0, 5.0), "weakly", False, "")
+    evidence = (Evidence(),) * len(effects)
+    state = Known(nothing, nothing, now, now, evidence, (), (), 0, (size,) * len(effects))
+    return [e.certainty for e in named_effects(state, RULES)[0]]
+
+
+def test_what_alone_explains_a_log_is_there_whichever_of_its_numbers_it_is() -> None:
+    knee, hip = CoulombFriction(places=("knee",)), CoulombFriction(places=("hip",))
+    assert told(knee)[0] > 0.9
+    assert told(knee, hip) == [0.5, 0.5]
 
 
 def test_models_that_leave_alike_weigh_alike_and_a_parameter_costs_what_it_gains_by_chance() -> None:

@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.closing import Candidate, NamedEffect
+from sysid_btr.diagnosis.closing import Candidate, NamedEffect, Verdict
 from sysid_btr.diagnosis.evidence import is_likely
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
+from sysid_btr.diagnosis.messages import message_of
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity
 from sysid_btr.diagnosis.selection import (
     Selection,
@@ -50,6 +51,7 @@ from sysid_btr.diagnosis.trials import (
 from sysid_btr.diagnosis.verdict import giving_way, verdict_of
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.refit import Fitted, paired_t
+from sysid_btr.identify.scores import Scores
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
@@ -755,7 +757,7 @@ def a_name(certainty: float, *rivals: str) -> NamedEffect:
     )
 
 
-SURE, DOUBTFUL, EITHER = a_name(0.9), a_name(0.4), a_name(0.9, "backlash")
+SURE, DOUBTFUL, EITHER, NEITHER = a_name(0.9), a_name(0.4), a_name(0.9, "backlash"), a_name(0.4, "backlash")
 
 
 @pytest.mark.parametrize(
@@ -772,11 +774,24 @@ SURE, DOUBTFUL, EITHER = a_name(0.9), a_name(0.4), a_name(0.9, "backlash")
         (fitted([60.0]), (DOUBTFUL, SURE), False, "partly_explained"),
         (fitted([3.5]), (SURE, EITHER), False, "ambiguous"),
         (fitted([3.7]), (EITHER,), False, "partly_explained"),
+        (fitted([3.5]), (SURE, NEITHER), False, "explained"),
+        (fitted([3.5]), (NEITHER,), False, "unexplained"),
         (fitted([150.0]), (SURE,), False, "unexplained"),
     ],
 )
 def test_verdict(now: Fitted, named: Sequence[NamedEffect], floating: bool, expected: str) -> None:
     assert verdict_of(RULES, fitted([101.0]), now, named, floating=floating) == expected
+
+
+@pytest.mark.parametrize("verdict", ["explained", "partly_explained", "ambiguous"])
+def test_the_message_tells_what_is_likely_from_what_is_not(verdict: Verdict) -> None:
+    sure, doubtful = replace(SURE, sentence="dry friction"), replace(NEITHER, sentence="a load", family="payload")
+    nothing = Scores({}, {})
+    said, _, added = message_of(verdict, (sure, doubtful), nothing, nothing, None).partition(" Also added, less likely")
+    assert "lacks dry friction" in said
+    assert "load" not in said
+    assert "a load, payload with 40 % certainty" in added
+    assert "Also added" not in message_of(verdict, (sure,), nothing, nothing, None)
 
 
 def test_a_short_log_may_leave_more_by_chance() -> None:

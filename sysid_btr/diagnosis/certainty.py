@@ -16,7 +16,8 @@ FAINT = 1e-3
 """How near to 0 and 1 a share is believed."""
 
 UNSIZED = 0.5
-"""Most that is said of a name whose size may be nothing: it is not more likely than not."""
+"""Most that is said of a name beside others, each of whose numbers may be nothing: it is not more likely than not. Of
+such names in `benchmarks.blind` (series 41 to 46, shape) 7 of 16 are right, and 7 of 7 that stand alone."""
 
 
 @dataclass(frozen=True)

@@ -82,15 +82,17 @@ def message_of(
                 f"right than not.{hint}"
             )
         return "Unexplained: no effect of the library accounts for what the model lacks." + hint + errors
-    listing = "; ".join(e.sentence for e in effects)
     if verdict == "partly_explained":
         return _partly(effects, _left(before, nearest, channel), left) + errors
+    likely = [e for e in effects if e.likely]
+    listing = "; ".join(e.sentence for e in likely)
     if left:
         errors += f" A residual remains that no effect accounts for: {left.get('summary', 'not characterised')}."
     if verdict == "ambiguous":
-        other = ", ".join(dict.fromkeys(c for e in effects for c in e.confused_with))
-        return f"Ambiguous: the model lacks {listing}; on this log it is confounded with {other}." + errors
-    return f"The model lacks {listing}." + errors
+        other = ", ".join(dict.fromkeys(c for e in likely for c in e.confused_with))
+        listing += f"; on this log it is confounded with {other}"
+    begin = "Ambiguous: the" if verdict == "ambiguous" else "The"
+    return f"{begin} model lacks {listing}.{_doubtful(effects)}{errors}"
 
 
 def _partly(effects: Sequence[NamedEffect], rest: str, left: Mapping[str, Any] | None) -> str:
@@ -100,9 +102,14 @@ def _partly(effects: Sequence[NamedEffect], rest: str, left: Mapping[str, Any] |
         f"{e.sentence}, {e.family} with {probability(e.certainty)} certainty{', its form open' * e.provisional}"
         for e in likely
     )
-    others = [e for e in effects if not e.likely]
-    if others:
-        added = "; ".join(f"{e.sentence}, {e.family} with {probability(e.certainty)} certainty" for e in others)
-        text += f". Also added, less likely than not to be what it is called: {added}"
-    text += f". Of the squared error above the noise, {rest} is left"
+    text += f".{_doubtful(effects)} Of the squared error above the noise, {rest} is left"
     return text + (f": {left.get('summary', 'not characterised')}." if left else ".")
+
+
+def _doubtful(effects: Sequence[NamedEffect]) -> str:
+    """A sentence on what was added and is no more likely right than not; empty where all is likely."""
+    others = [e for e in effects if not e.likely]
+    if not others:
+        return ""
+    added = "; ".join(f"{e.sentence}, {e.family} with {probability(e.certainty)} certainty" for e in others)
+    return f" Also added, less likely than not to be what it is called: {added}."

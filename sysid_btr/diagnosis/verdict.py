@@ -29,10 +29,13 @@ def verdict_of(
     limit = verdict_limit(rules, before.overall_chance)
     if not named:
         return "nothing_missing" if max(now.holdout, now.train) <= limit else "unexplained"
+    likely = [e for e in named if e.likely]
+    if not likely:
+        return "unexplained"
     if is_log_explained(rules, before, now, floating=floating):
-        return "ambiguous" if any(e.confused_with for e in named) else "explained"
+        return "ambiguous" if any(e.confused_with for e in likely) else "explained"
     # what predicts data that were not fitted worse than the model without it is no explanation
-    return "partly_explained" if any(e.likely for e in named) and now.holdout < before.holdout else "unexplained"
+    return "partly_explained" if now.holdout < before.holdout else "unexplained"
 
 
 def conclude(state: State, verdict: Verdict, named: Sequence[NamedEffect], rules: Selection, seconds: float) -> Closing:
@@ -90,7 +93,9 @@ def _named(
     now = state.fitted
     left = left_where_it_acts(off, now)
     known = {"family": evidence.family, "place": evidence.place, "left": left}
-    sized = any(differs_from(estimate, nothing) for estimate, nothing in zip(own, effect.neutral, strict=True))
+    # what alone explains a log is there, whichever of its numbers it is
+    alone = len(state.effects) == 1
+    sized = alone or any(differs_from(estimate, nothing) for estimate, nothing in zip(own, effect.neutral, strict=True))
     sure = certainty.STANDARD.certainty(known, sized=sized)
     rest = sum(evidence.others.values())
     otherwise = {name: (1 - sure) * weight / max(rest, evidence.family) for name, weight in evidence.others.items()}
