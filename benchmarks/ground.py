@@ -108,7 +108,7 @@ def record(walker: Walker) -> Log | None:
     joints = tuple(model.actuator(i).name for i in range(model.nu))
     address = [model.jnt_qposadr[model.joint(j).id] for j in joints]
     time = np.arange(0, SECONDS - 1e-9, PERIOD)
-    commands = _commands(walker, time, joints)
+    commands = commands_of(walker, time, joints)
     feet = _Feet(model, walker.ground)
     mujoco.set_mjcb_passive(feet.push)
     try:
@@ -131,7 +131,7 @@ def record(walker: Walker) -> Log | None:
     return _log(model, time, joints, commands, np.array(rows), np.random.default_rng([18, walker.seed]))
 
 
-def _commands(walker: Walker, time: np.ndarray[Any, Any], joints: Sequence[str]) -> np.ndarray[Any, Any]:
+def commands_of(walker: Walker, time: np.ndarray[Any, Any], joints: Sequence[str]) -> np.ndarray[Any, Any]:
     """The gait, with arms that swing: (n, joints)."""
     found = dict(gait(walker.gait, time))
     fade = np.clip(time - 0.5, 0, 1) * walker.arms
