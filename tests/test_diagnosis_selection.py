@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, NamedEffect, Verdict
-from sysid_btr.diagnosis.evidence import is_likely
+from sysid_btr.diagnosis.evidence import evidence_of, is_likely
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
 from sysid_btr.diagnosis.messages import message_of
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity
@@ -47,6 +47,7 @@ from sysid_btr.diagnosis.trials import (
     is_outdone,
     is_rival,
     is_superfluous,
+    may_be_elsewhere,
 )
 from sysid_btr.diagnosis.verdict import giving_way, verdict_of
 from sysid_btr.identify.intervals import Estimate
@@ -554,6 +555,25 @@ def test_choose_what_explains_the_fitted_part_where_held_out_data_want_nothing(
 )
 def test_is_rival(winner: Trial, other: Trial, expected: bool) -> None:
     assert is_rival(RULES, winner, other) is expected
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [
+        (trial(SIMPLE, fitted([5.7]), "hip"), True),
+        (trial(SIMPLE, fitted([5.9]), "hip"), False),
+        (trial(SIMPLE, fitted([5.0])), False),
+        (trial(SIMPLE, fitted([5.0]), "hip", "ankle"), False),
+        (trial(OTHER, fitted([5.0]), "hip"), False),
+    ],
+)
+def test_the_same_may_sit_elsewhere(other: Trial, expected: bool) -> None:
+    winner = trial(SIMPLE, fitted([5.0]))
+    assert may_be_elsewhere(RULES, winner, other) is expected
+    sure = trial(SIMPLE, fitted([5.0], ahead=3.1))
+    assert not may_be_elsewhere(RULES, sure, other)
+    rivals = evidence_of(RULES, winner, [winner, other]).rivals
+    assert (str(other.hypothesis) in rivals) is expected
 
 
 def test_candidates_are_listed_best_first_with_those_that_did_as_well() -> None:

@@ -35,7 +35,7 @@ class NamedEffect:
         what is left without it once all others are fitted again.
     provisional : whether something is left where it acts, so that its form, or it, may be another.
     gain_holdout : fraction of the held-out chi2 that vanishes with it, likewise.
-    confused_with : effects with which it is confounded on this log.
+    confused_with : effects with which it is confounded on this log, and itself at another place (``payload at thigh``).
     sentence : the finding in words.
     evidence : what the certainty rests on, by name.
     """

@@ -17,7 +17,7 @@ from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.certainty import STANDARD
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import Selection
-from sysid_btr.diagnosis.trials import Trial, is_rival
+from sysid_btr.diagnosis.trials import Trial, is_rival, may_be_elsewhere
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.terms.effect import family_of
 from sysid_btr.terms.free_form import FREE_FORMS
@@ -34,7 +34,7 @@ class Evidence:
 
     Attributes
     ----------
-    rivals : effects that do nearly as well.
+    rivals : effects that do nearly as well, and other places at which the same effect does.
     family, place : weight of all trials with an effect of this family, and of all at a place that this one is at.
     others : weight of each other family that was tried.
     alternatives : the best hypothesis of each of these, to be tried again once the model is complete.
@@ -75,8 +75,9 @@ def evidence_of(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Evi
     told = dict(sorted(((n, w) for n, w in others.items() if w > LEAST_WEIGHT), key=lambda x: -x[1]))
     likely = sorted((n for n, w in tried.items() if w > LEAST_WEIGHT), key=lambda n: -tried[n])
     alternatives = tuple(best[name][1] for name in likely)
-    rivals = tuple(dict.fromkeys(t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)))
-    return Evidence(rivals, float(family), float(place), told, alternatives)
+    rivals = [t.hypothesis.effect.name for t in trials if is_rival(rules, winner, t)]
+    elsewhere = [str(t.hypothesis) for t in trials if may_be_elsewhere(rules, winner, t)]
+    return Evidence(tuple(dict.fromkeys(rivals + elsewhere)), float(family), float(place), told, alternatives)
 
 
 def _is_a_case_of(one: Hypothesis, other: Hypothesis) -> bool:

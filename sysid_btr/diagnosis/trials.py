@@ -258,9 +258,22 @@ def is_rival(rules: Selection, winner: Trial, other: Trial) -> bool:
     effect, rival = winner.hypothesis.effect, other.hypothesis.effect
     if rival.name == effect.name or effect.name in (*rival.includes, *rival.yields_to):
         return False
-    if other.fitted.misfit > winner.fitted.misfit + rules.rival:
-        return False
-    return paired_t(winner.fitted, other.fitted) < rules.t
+    return _does_as_well(rules, winner, other)
+
+
+def may_be_elsewhere(rules: Selection, winner: Trial, other: Trial) -> bool:
+    """Whether an effect at one place does nearly as well at another, and held-out data cannot decide.
+
+    What sits on a body that hardly moves against its neighbour may as well sit on that.
+    """
+    ours, theirs = winner.hypothesis, other.hypothesis
+    single = len(ours.places) == len(theirs.places) == 1 and ours.places != theirs.places
+    return single and ours.effect is theirs.effect and _does_as_well(rules, winner, other)
+
+
+def _does_as_well(rules: Selection, winner: Trial, other: Trial) -> bool:
+    near = other.fitted.misfit <= winner.fitted.misfit + rules.rival
+    return near and paired_t(winner.fitted, other.fitted) < rules.t
 
 
 def candidates_of(
