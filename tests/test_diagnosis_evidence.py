@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from sysid_btr.diagnosis.certainty import STANDARD
 from sysid_btr.diagnosis.evidence import (
     Evidence,
+    at_the_likeliest_place,
     evidence_of,
     is_missed,
     left_where_it_acts,
@@ -163,6 +164,32 @@ def test_a_model_is_preferred_that_predicts_held_out_data_better_in_most_columns
     assert preference(better, before) < 0.05
     harmful = left(np.vstack([even(15.0), even(60.0)]), memory=COUNT)  # helps one column, and spoils another
     assert preference(before, harmful) < 0.1
+
+
+def at(place: str, fitted: float, heldout: float) -> Trial:
+    """Dry friction at a joint, and what it leaves of both parts."""
+    chi2 = even(fitted)
+    now = replace(
+        left(even(heldout)),
+        train_columns=chi2.mean(axis=1),
+        train_cells=chi2 * COUNT,
+        train_counts=np.full(chi2.shape, COUNT),
+    )
+    return Trial(Hypothesis(CoulombFriction, (place,), False, np.ones(1), 1.0), now)
+
+
+@pytest.mark.parametrize(
+    ("hip", "moves"),
+    [
+        (at("hip", 1.5, 2.01), True),  # held-out data hardly tell the two apart, fitted ones do
+        (at("hip", 1.7, 2.01), False),
+        (at("hip", 1.5, 2.6), False),  # held-out data tell
+        (at("hip", 1.6, 2.0), False),  # alike
+    ],
+)
+def test_of_places_at_which_an_effect_does_as_well_it_goes_where_all_data_say_more(hip: Trial, moves: bool) -> None:
+    knee = at("knee", 1.6, 2.0)
+    assert at_the_likeliest_place(RULES, knee, [hip, knee]) is (hip if moves else knee)
 
 
 @given(st.lists(st.floats(1.0, 50.0), min_size=2, max_size=6), st.integers(0, 5))

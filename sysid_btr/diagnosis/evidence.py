@@ -92,6 +92,13 @@ def is_likely(rules: Selection, before: Fitted, winner: Trial, trials: Sequence[
     return STANDARD.certainty({"family": known.family, "place": known.place, "left": left}) >= rules.likely
 
 
+def at_the_likeliest_place(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Trial:
+    """The winner of some trials, or the same effect at that other place of which all data, fitted too, say more."""
+    alike = [winner, *(t for t in trials if may_be_elsewhere(rules, winner, t))]
+    share = weights([t.fitted for t in alike], winner.fitted, [t.hypothesis.complexity for t in alike])
+    return alike[int(np.argmax(share))]
+
+
 def preference(before: Fitted, after: Fitted) -> float:
     """Weight, 0 to 1, of a model against the one before it, on held-out data, which neither was fitted to."""
     pair = np.stack([_heldout_density(model, after) for model in (before, after)])

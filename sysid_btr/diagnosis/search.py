@@ -9,7 +9,7 @@ from math import nan
 import numpy as np
 
 from sysid_btr.diagnosis.elimination import without_dispensable
-from sysid_btr.diagnosis.evidence import evidence_of, is_likely, preference, weights
+from sysid_btr.diagnosis.evidence import at_the_likeliest_place, evidence_of, is_likely, preference, weights
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
 from sysid_btr.diagnosis.selection import (
@@ -132,7 +132,9 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
 
 
 def _best(state: State, trials: Sequence[Trial], rules: Selection) -> Trial | None:
-    return choose(rules, state.fitted, [t for t in trials if _is_worthy(rules, state, t)])
+    worthy = [t for t in trials if _is_worthy(rules, state, t)]
+    winner = choose(rules, state.fitted, worthy)
+    return None if winner is None else at_the_likeliest_place(rules, winner, worthy)
 
 
 def _simplified(
