@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid_btr.diagnosis.certainty import STANDARD
+from sysid_btr.diagnosis.elimination import _merged
 from sysid_btr.diagnosis.evidence import (
     Evidence,
     at_the_likeliest_place,
@@ -34,8 +35,10 @@ from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
+from sysid_btr.terms.scales import JointScale
 from sysid_btr.terms.spring import JointSpring, Tether
 
+RUBS = {"knee": 0.1, "hip": 0.3}
 COUNT = 50.0
 """Samples in a stretch."""
 
@@ -97,6 +100,18 @@ def test_what_alone_explains_a_log_is_there_whichever_of_its_numbers_it_is() -> 
     knee, hip = CoulombFriction(places=("knee",)), CoulombFriction(places=("hip",))
     assert told(knee)[0] > 0.9
     assert told(knee, hip) == [0.5, 0.5]
+
+
+def test_an_effect_is_not_confused_with_itself_where_it_is() -> None:
+    model = Model.joined((CoulombFriction(places=(place,)), np.array([size])) for place, size in RUBS.items())
+    study: Any = SimpleNamespace(scales=dict.fromkeys(RUBS, JointScale(10.0, 20.0, 1.0, 2.0, 1.0, 1.0)))
+    nothing: Any = SimpleNamespace(model=Model.of(()))
+    now = replace(left(even(1.1)), model=model)
+    evidence = tuple(Evidence((f"coulomb_friction at {place}", "backlash")) for place in ("hip", "ankle"))
+    state = _merged(Known(study, nothing, now, now, evidence, (), (), 0, ()), RULES)
+    assert [e.places for e in state.effects] == [("knee", "hip")]
+    # what each was taken for: the other, which is there, and friction at the ankle, which is not
+    assert state.evidence[0].rivals == ("backlash", "coulomb_friction at ankle")
 
 
 def test_models_that_leave_alike_weigh_alike_and_a_parameter_costs_what_it_gains_by_chance() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.diagnosis.evidence import Evidence, is_missed
 from sysid_btr.diagnosis.exchange import exchange
-from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.hypotheses import Hypothesis, name_at
 from sysid_btr.diagnosis.joining import as_curves
 from sysid_btr.diagnosis.leads import Library
 from sysid_btr.diagnosis.selection import (
@@ -177,8 +177,9 @@ def _merged(state: State, rules: Selection) -> State:
         even = len(found) > 2 and agree(amounts[:, kind.main], rules.common_amount)
         values = np.median(amounts, axis=0) if even else amounts.ravel()
         model = model.with_(kind.at(places, state.study.scales, shared=even).around(values), values)
-    # what is in the model beside an effect is not its rival
-    kept = tuple(own.beside([kind.name for kind in pieces]) for own in known.values())
+    # what is in the model beside an effect is not its rival, nor is the effect itself where it is
+    there = [name_at(kind, (place,)) for kind, found in pieces.items() for place, _ in found]
+    kept = tuple(own.beside([*(kind.name for kind in pieces), *there]) for own in known.values())
     return replace(state, fitted=replace(state.fitted, model=model), evidence=kept)
 
 

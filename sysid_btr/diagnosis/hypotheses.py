@@ -52,8 +52,13 @@ class Hypothesis:
         return self.effect.at(self.places, scales, shared=self.shared).around(self.start)
 
     def __str__(self) -> str:
-        places = ", ".join(self.places) if len(self.places) < 5 else f"{len(self.places)} places"
-        return f"{self.effect.label or self.effect.name} at {places}"
+        return name_at(self.effect, self.places)
+
+
+def name_at(effect: type[Effect], places: Sequence[str]) -> str:
+    """An effect and where it is, as it is told."""
+    where = ", ".join(places) if len(places) < 5 else f"{len(places)} places"
+    return f"{effect.label or effect.name} at {where}"
 
 
 def form_hypotheses(found: Sequence[Sensitivity], residuals: int, scales: Scales, rules: Selection) -> list[Hypothesis]:
