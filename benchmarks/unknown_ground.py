@@ -41,50 +41,44 @@ RESULTS = Path(__file__).parent / "results" / "unknown_ground.json"
 BODIES = tuple(side + part for part in ("HipPitch", "KneePitch") for side in "RL")
 GAINS = ("kp:*=shared", "kv:*=shared")
 TASK, NAO = Walk(16.0), load_robot("nao")
-LEGS = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
+PARTS = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
 CONTACT = "contact"
 TRIES = 50
 
 
 @dataclass(frozen=True)
 class Missing:
-    """What nobody declares: families by which it may be called, places, and how the robot has it."""
+    """What nobody declares: its family, its places, and how the robot has it."""
 
-    families: frozenset[str]
+    family: str
     where: frozenset[str]
     truth: Mapping[str, Any]
 
 
 def torso_load(rng: Generator) -> Missing:
     place = tuple(rng.uniform([-0.06, -0.03, -0.02], [0.06, 0.03, 0.1]).tolist())
-    return Missing(
-        frozenset({"payload"}), frozenset({"Torso"}), {"payload": {"Torso": (float(rng.uniform(0.2, 0.6)), place)}}
-    )
+    return Missing("payload", frozenset({"Torso"}), {"payload": {"Torso": (float(rng.uniform(0.2, 0.6)), place)}})
 
 
 def leg_load(rng: Generator) -> Missing:
     body = str(rng.choice(BODIES))
     place = tuple(rng.uniform([0.0, -0.04, -0.1], [0.06, 0.04, 0.0]).tolist())
-    return Missing(
-        frozenset({"payload"}), frozenset({body}), {"payload": {body: (float(rng.uniform(0.1, 0.3)), place)}}
-    )
+    return Missing("payload", frozenset({body}), {"payload": {body: (float(rng.uniform(0.1, 0.3)), place)}})
 
 
 def late_commands(rng: Generator) -> Missing:
-    return Missing(frozenset({"delay"}), frozenset(NaoGait().joints), {"delay": 0.002 * float(rng.integers(6, 24))})
+    return Missing("delay", frozenset(NaoGait().joints), {"delay": 0.002 * float(rng.integers(6, 24))})
 
 
 def rubbing(rng: Generator) -> Missing:
-    parts = rng.choice(LEGS, int(rng.integers(1, 3)), replace=False)
+    parts = rng.choice(PARTS, int(rng.integers(1, 3)), replace=False)
     joints = [side + str(part) for part in parts for side in "RL"]
-    return Missing(
-        frozenset({"friction"}), frozenset(joints), {"friction": dict.fromkeys(joints, float(rng.uniform(0.1, 0.3)))}
-    )
+    return Missing("friction", frozenset(joints), {"friction": dict.fromkeys(joints, float(rng.uniform(0.1, 0.3)))})
 
 
 def weak_joint(rng: Generator) -> Missing:
-    joint = str(rng.choice(list("RL"))) + str(rng.choice(LEGS))
-    return Missing(frozenset({"gain"}), frozenset({joint}), {"kp": {joint: float(rng.uniform(0.5, 0.75))}})
+    joint = str(rng.choice(list("RL"))) + str(rng.choice(PARTS))
+    return Missing("gain", frozenset({joint}), {"kp": {joint: float(rng.uniform(0.5, 0.75))}})
 
 
 KINDS: tuple[Callable[[Generator], Missing], ...] = (torso_load, leg_load, late_commands, rubbing, weak_joint)
@@ -175,7 +169,7 @@ def judged(missing: Missing, told: Sequence[Mapping[str, Any]], verdict: str) ->
         family: frozenset(p for e in told if e["family"] == family for p in e["where"])
         for family in dict.fromkeys(e["family"] for e in told)
     }
-    false = [f for f, where in places.items() if f not in missing.families or not where <= missing.where]
+    false = [f for f, where in places.items() if f != missing.family or not where <= missing.where]
     if false:
         return "wrong" if verdict == "explained" else "provisional"
     found = frozenset().union(*places.values())
