@@ -42,6 +42,8 @@ BODIES = tuple(side + part for part in ("HipPitch", "KneePitch") for side in "RL
 GAINS = ("kp:*=shared", "kv:*=shared")
 TASK, NAO = Walk(16.0), load_robot("nao")
 PARTS = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
+STEP = 2.5e-4
+"""s, of Drake's steps, which are of first order: kv comes out 0.6 % high for them, kp 0.1 %."""
 CONTACT = "contact"
 TRIES = 50
 
@@ -114,7 +116,7 @@ def walker(number: int) -> Walker:
         )
         moves = draw(int(rng.integers(1 << 30)))
         commands = commands_of(replace(moves, arms=0.5 * moves.arms), TASK.time, joints)
-        motion = DrakeRobot(NAO, TASK, NaoGait(), truth).play(commands)
+        motion = DrakeRobot(NAO, TASK, NaoGait(), truth, step=STEP).play(commands)
         if not TASK.fallen(motion.base[None]).any():
             log = recorded(motion, TASK, joints, Noise(), rng, "nao").log
             assert log is not None
