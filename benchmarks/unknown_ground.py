@@ -43,7 +43,9 @@ GAINS = ("kp:*=shared", "kv:*=shared")
 TASK, NAO = Walk(16.0), load_robot("nao")
 PARTS = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
 STEP = 2.5e-4
-"""s, of Drake's steps, which are of first order: kv comes out 0.6 % high for them, kp 0.1 %."""
+"""s, of Drake's steps, which are of first order and act like a latency of half of one."""
+DAMPING_TIME = 0.02
+"""s, kv over kp of the Nao's servos."""
 CONTACT = "contact"
 TRIES = 50
 
@@ -132,7 +134,10 @@ def examine(number: int, threads: int) -> dict[str, Any]:
     result = close(make_study(NAO, [one.log], threads=threads), declared).to_dict()
     seconds = process_time() - began
     told = [e for e in result["effects"] if e["certainty"] > 0.5 and e["family"] != CONTACT]
-    true = {f"mass:{body}": factor for body, factor in one.truth.mass.items()} | {"kp:*": one.truth.gain, "kv:*": 1.0}
+    true = {f"mass:{body}": factor for body, factor in one.truth.mass.items()} | {
+        "kp:*": one.truth.gain,
+        "kv:*": 1.0 + one.truth.gain * STEP / 2 / DAMPING_TIME,
+    }
     return {
         "walk": number,
         "lacks": one.missing.truth,

@@ -34,6 +34,7 @@ from sysid_btr.diagnosis.selection import (
     is_explained,
     is_log_explained,
     is_needed,
+    relieves,
     something_left,
     verdict_limit,
 )
@@ -58,6 +59,7 @@ from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FreeFrictionSpeed, FreeTorqueLoad, FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionLarger, StribeckFriction, ViscousDamping
+from sysid_btr.terms.inertial import Mass, Payload
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import JointScale, Scales
 from sysid_btr.terms.sensing import SensorDelay
@@ -312,6 +314,35 @@ def test_what_removes_all_that_is_left_is_no_trace_however_far_off_the_first_mod
     assert not has_minimum_gain(RULES, first, now, fitted([7.0]))
     for may_fit_anything in ({"learnt": True}, {"transient": True}):
         assert not has_minimum_gain(RULES, first, now, fitted([1.0]), **may_fit_anything)
+
+
+def far(off: float, loss: float = 1000.0, holdout: float = 1.0, effect: Effect | None = None) -> Fitted:
+    """A fit of the mass of a knee that is so many of robots' spreads off, perhaps beside an effect."""
+    model = Model.of((Mass(("knee",)), *((effect,) if effect else ())))
+    cells = np.full((1, 4), loss / 4)
+    return replace(fitted([holdout], model=model), train_cells=cells, off=np.array([off]))
+
+
+LOAD = Payload(("hip",))
+
+
+@pytest.mark.parametrize(
+    ("without", "now", "expected"),
+    [
+        (far(7.0), far(1.0, effect=LOAD), True),  # 49 - 1 for nothing
+        (far(7.0), far(1.0, 1015.0, effect=LOAD), False),  # of which the data take too much
+        (far(6.0), far(1.0, effect=LOAD), False),
+        (far(6.0), far(1.0, 990.0, effect=LOAD), True),
+        (far(7.0), far(1.0, holdout=1.02, effect=LOAD), False),
+        (far(7.0), far(1.0, effect=Payload(("knee",))), False),  # that is the mass of the knee
+        (far(3.0, 1040.0), far(1.0, effect=LOAD), False),  # nothing is wrong with a mass like this
+    ],
+)
+def test_an_effect_relieves_a_model_of_masses_that_robots_do_not_have(
+    without: Fitted, now: Fitted, expected: bool
+) -> None:
+    assert relieves(RULES, without, now) is expected
+    assert is_needed(RULES, without, now) is expected
 
 
 # --- locations and amounts ----------------------------------------------------------------------------------------
@@ -872,7 +903,7 @@ def test_the_time_to_which_the_fitted_part_is_extended(by_stretch: FloatArray, n
     assert cut_time(by_stretch, now, 10.0, RULES) == expected
 
 
-RULES_OF_ONE_COLUMN: list[Callable[..., Any]] = [improves, improves_once, explains_fitted, is_needed]
+RULES_OF_ONE_COLUMN: list[Callable[..., Any]] = [improves, improves_once, explains_fitted, relieves, is_needed]
 
 
 @pytest.mark.parametrize("rule", RULES_OF_ONE_COLUMN, ids=lambda rule: rule.__name__)

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import toys
+from scipy.stats import chi2
 
 from sysid_btr.display.text import exactness
 from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.fit import Fit, fit
-from sysid_btr.identify.prior import MapProblem, Stated
+from sysid_btr.identify.prior import MapProblem, Stated, doubt, is_implausible
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.models.builtin import load_robot
@@ -25,11 +26,11 @@ HEAVY = 1.6
 FREED = ("mass:knee,ankle", "kp:*=shared")
 
 
-def recorded(effect: Effect | None = None, size: float = 0.0) -> Log:
+def recorded(effect: Effect | None = None, size: float = 0.0, heavy: float = HEAVY) -> Log:
     """Eight seconds of the toy leg with a heavy knee, and friction that nobody declares, by another integrator."""
     robot, log = toys.leg(), toys.swing(toys.LEG_JOINTS, seconds=8.0, size=0.35)
     declared = make_study(robot, [log], numerics=toys.FINE).declare(("mass:knee",))
-    terms, values = (*declared, *((effect,) if effect else ())), [HEAVY, *([size] if effect else [])]
+    terms, values = (*declared, *((effect,) if effect else ())), [heavy, *([size] if effect else [])]
     outputs = toys.run(robot, log, terms, values, Numerics("RK4", 0.0025))
     noise = np.random.default_rng(3).normal(0, 5e-4, outputs.position[0].shape)
     shown = {f"position.{j}": outputs.position[0, :, i] + noise[:, i] for i, j in enumerate(toys.LEG_JOINTS)}
@@ -55,6 +56,31 @@ def test_who_states_bounds_knows_better_than_the_model() -> None:
     robot = replace(toys.leg(), bounds={"mass:knee": (0.1, 10.0)})
     stated = Stated.of(Terms(parse_parameters(FREED, robot)).parameters)
     np.testing.assert_array_equal(stated.weight > 0, [False, True, False])
+
+
+@pytest.mark.parametrize(("level", "expected"), [(0.9, True), (1.1, False)])
+@pytest.mark.parametrize("count", [1, 3, 22])
+def test_numbers_are_implausible_that_one_robot_of_ten_thousand_has(count: int, level: float, expected: bool) -> None:
+    """Exactly: the sum of squares of so many standard normal numbers exceeds this one time in ten thousand."""
+    far = np.sqrt(chi2.isf(1e-4 * level, count) / count)
+    assert is_implausible(np.full(count, far)) is expected
+    assert not is_implausible(np.zeros(0))
+
+
+def test_implausible_masses_are_told_with_what_they_are() -> None:
+    parameters = Terms(parse_parameters(FREED, toys.leg())).parameters
+    assert doubt(parameters, np.array([1.6, 0.7, 5.0])) == ""
+    why = "further from the model than robots are: something that acts like"
+    assert doubt(parameters, np.array([2.0, 1.2, 1.0])) == f"mass:knee 2 is {why} it may be missing"
+    assert (
+        doubt(parameters, np.array([0.3, 1.9, 1.0])) == f"mass:knee 0.3, mass:ankle 1.9 are {why} them may be missing"
+    )
+
+
+def test_a_fit_warns_of_masses_that_robots_do_not_have() -> None:
+    plausible, other = (fit(study_of(recorded(heavy=h)), ("mass:knee", "kp:*=shared")) for h in (HEAVY, 2.0))
+    assert "further" not in plausible.message
+    assert "mass:knee 2 is further from the model than robots are" in other.message
 
 
 def test_a_right_model_is_fitted_without_it() -> None:

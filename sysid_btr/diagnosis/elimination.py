@@ -36,6 +36,9 @@ Wanted = Callable[[Selection, Fitted, Fitted], bool]
 """Whether data want what the first model lacks of the second."""
 SETTLED = 0.5
 """Standard errors by which a turn of initial states and parameters moves these when it is the last."""
+LEAVES_MORE = 1.01
+"""Ratio of what a turn leaves to what the one before left, from which it is not taken: turns minimise nothing together,
+and may wander off to where friction is at one joint what it was at two."""
 
 
 def eliminate(state: State, library: Library, rules: Selection, progress: Progress) -> State:
@@ -48,13 +51,7 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
     state = state if joined is state else _pruned(joined, rules)
     progress(done=state.replays, total=None, best=nan, note="each effect against what else it may be")
     state = _merged(exchange(state, library, rules), rules).in_first_steps()
-    for _ in range(state.study.procedure.last_turns):
-        # they were those of a model that lacked its last effect
-        study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)
-        again, before = refit(study, state.fitted.model), state.fitted.model.values
-        state = replace(state, study=study, fitted=again).spent(again.evaluations)
-        if np.all(np.abs(again.model.values - before) <= SETTLED * _standard_errors(state)):
-            break
+    state = _states_in_turn(state)
     study = inflate(state.study, state.fitted, memory=True)
     progress(done=state.replays, total=None, best=nan, note="final fit")
     polished = refit(study, state.fitted.model, polish=True, progress=without_loss(progress))
@@ -64,6 +61,20 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
     real = _distinguishable_from_nothing(state, library, rules)
     if real is not None:
         state = with_intervals(real.step(removed=_gone(state, real)), rules)
+    return state
+
+
+def _states_in_turn(state: State) -> State:
+    """Initial states, which were those of a model that lacked its last effect, and parameters in turn."""
+    for _ in range(state.study.procedure.last_turns):
+        study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)
+        again, before = refit(study, state.fitted.model), state.fitted
+        state = state.spent(again.evaluations)
+        if not again.train < LEAVES_MORE * before.train:
+            break
+        state = replace(state, study=study, fitted=again)
+        if np.all(np.abs(again.model.values - before.model.values) <= SETTLED * _standard_errors(state)):
+            break
     return state
 
 

@@ -94,9 +94,13 @@ def is_likely(rules: Selection, before: Fitted, winner: Trial, trials: Sequence[
 
 def at_the_likeliest_place(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Trial:
     """The winner of some trials, or the same effect at that other place of which all data, fitted too, say more."""
-    alike = [winner, *(t for t in trials if may_be_elsewhere(rules, winner, t))]
-    share = weights([t.fitted for t in alike], winner.fitted, [t.hypothesis.complexity for t in alike])
-    return alike[int(np.argmax(share))]
+    return likeliest([winner, *(t for t in trials if may_be_elsewhere(rules, winner, t))])
+
+
+def likeliest(trials: Sequence[Trial]) -> Trial:
+    """That of some trials of which all data, and what the model states, say most."""
+    share = weights([t.fitted for t in trials], trials[0].fitted, [t.hypothesis.complexity for t in trials])
+    return trials[int(np.argmax(share))]
 
 
 def preference(before: Fitted, after: Fitted) -> float:
@@ -122,7 +126,8 @@ def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -
     parameters : (m,) that each has beside what all have; each costs as much as it gains by chance (Akaike 1974).
     """
     density = np.stack([np.concatenate([_fitted_density(m, best), _heldout_density(m, best)]) for m in models])
-    return _shares(density, np.asarray(parameters, dtype=np.float64))
+    believed = np.array([0.5 * float(m.off @ m.off) for m in models])
+    return _shares(density, np.asarray(parameters, dtype=np.float64) + believed)
 
 
 def _shares(density: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -154,11 +159,12 @@ def _log_density(cells: FloatArray, counts: FloatArray, chi2: FloatArray, memory
 def left_where_it_acts(without: Fitted, now: Fitted) -> float:
     """Share of the excess, in the columns that an effect explains, that is left with it; 0 to 1.
 
-    Columns count by how much the effect improves their predictive density.
+    Columns count by how much the effect improves their predictive density, and so does what the model states.
     """
-    gain = np.maximum(without.columns - now.columns, 0.0)
-    left = np.maximum(now.columns - 1, 0.0)
-    weight = np.log(np.maximum(without.columns, 1e-300) / np.maximum(now.columns, 1e-300))
+    before, after = (np.append(m.columns, [np.mean(m.off**2)] if len(m.off) else []) for m in (without, now))
+    gain = np.maximum(before - after, 0.0)
+    left = np.maximum(after - 1, 0.0)
+    weight = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
     weight = np.maximum(weight, 0.0)
     if not weight.sum() > 0:
         return 1.0

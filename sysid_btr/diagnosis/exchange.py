@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import IntArray
-from sysid_btr.diagnosis.evidence import evidence_of, is_likely, is_missed
+from sysid_btr.diagnosis.evidence import evidence_of, is_likely, is_missed, likeliest
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, replacements
 from sysid_btr.diagnosis.selection import Selection
@@ -108,7 +108,8 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     for hypothesis in hypotheses:
         trials.append(attempt(state.study, rest, hypothesis, rules, [t.fitted for t in trials]))
     state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
-    winner = preferred(rules, trials)
+    # where the model states what decides, data show next to nothing of it
+    winner = likeliest(trials) if state.study.held else preferred(rules, trials)
     if winner is not trials[0] and state.study.procedure.wanders and not is_likely(rules, state.fitted, winner, trials):
         # what is left grows in such a replay, and much would take it up: see `search`
         winner = trials[0]

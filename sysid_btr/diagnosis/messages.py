@@ -61,8 +61,12 @@ def message_of(
     left: Mapping[str, Any] | None,
     channel: str = "position",
     unit: str = "rad",
+    doubt: str = "",
 ) -> str:
-    """The verdict in one sentence, with the held-out error; `effects` are the best there are, `nearest` with them."""
+    """The verdict in one sentence, with the held-out error; `effects` are the best there are, `nearest` with them.
+
+    `doubt` is what is to be said of the declared parameters alone.
+    """
     errors = ""
     if channel in before.holdout and channel in nearest.holdout:
         old, new, floor = si_all(
@@ -71,6 +75,8 @@ def message_of(
         change = old if verdict in ("unexplained", "nothing_missing") else f"{old} -> {new}"
         errors = f" Held-out {channel} error {change} (noise floor {floor})."
     if verdict == "nothing_missing":
+        if doubt:
+            return f"The declared parameters explain the log down to its noise, but {doubt}.{errors}"
         return "Nothing is missing: the declared parameters explain the log down to its noise." + errors
     if verdict == "unexplained":
         hint = "" if not left else f" The residual is {left.get('summary', 'not characterised')}."

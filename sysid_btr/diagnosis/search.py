@@ -9,7 +9,7 @@ from math import nan
 import numpy as np
 
 from sysid_btr.diagnosis.elimination import without_dispensable
-from sysid_btr.diagnosis.evidence import at_the_likeliest_place, evidence_of, is_likely, preference, weights
+from sysid_btr.diagnosis.evidence import at_the_likeliest_place, evidence_of, is_likely, likeliest, preference, weights
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
 from sysid_btr.diagnosis.selection import (
@@ -20,6 +20,7 @@ from sysid_btr.diagnosis.selection import (
     has_minimum_gain,
     improves,
     is_log_explained,
+    relieves,
     something_left,
 )
 from sysid_btr.diagnosis.state import State
@@ -36,6 +37,7 @@ from sysid_btr.diagnosis.trials import (
 )
 from sysid_btr.estimators.base import Budget, Progress
 from sysid_btr.identify.bounds import fit_beyond
+from sysid_btr.identify.prior import Stated, is_implausible
 from sysid_btr.identify.recorder import as_recorded, own_steps
 from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.progress import phase
@@ -61,7 +63,9 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
     """
     sure, doubtful = state, list[Hypothesis]()
     for number in range(1, rules.rounds + 1):
+        state = _held_to_model(state)
         enough = at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted)
+        enough = enough and not is_implausible(state.fitted.off)
         if enough or not could_gain(rules, state.before, state.fitted):
             break
         if number == OWN_STEPS_FROM:
@@ -107,6 +111,20 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
     return state
 
 
+def _held_to_model(state: State) -> State:
+    """The state held to what the model states of its masses, where the log alone asks for some that robots do not have.
+
+    What is missing may be imitated by these down to the noise.
+    """
+    alone = Stated.of(state.fitted.model.terms.parameters).whitened(state.fitted.model.values[None])[0]
+    if state.study.redundancy or not is_implausible(alone):
+        return state
+    study = state.study.held_to_model()
+    fitted = refit(study, state.fitted.model)
+    held = replace(state, study=study, fitted=fitted) if is_implausible(fitted.off) else state
+    return held.spent(fitted.evaluations)
+
+
 def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
     """Whether a trial removes more than a trace, and beside others more than what these leave looks like.
 
@@ -114,6 +132,8 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
     correlated as those that are left: a part of a wrong model's error vanishes with almost anything. Held-out data are
     asked alone, if they show anything of it; what happens once they cannot know.
     """
+    if relieves(rules, state.fitted, trial.fitted):
+        return True
     effect, beside = trial.hypothesis.effect, bool(state.effects)
     more = has_minimum_gain(
         rules,
@@ -133,6 +153,11 @@ def _is_worthy(rules: Selection, state: State, trial: Trial) -> bool:
 
 def _best(state: State, trials: Sequence[Trial], rules: Selection) -> Trial | None:
     worthy = [t for t in trials if _is_worthy(rules, state, t)]
+    if state.study.held:
+        # data show next to nothing of it
+        sparing = [t for t in worthy if relieves(rules, state.fitted, t.fitted)]
+        if sparing:
+            return likeliest(sparing)
     winner = choose(rules, state.fitted, worthy)
     return None if winner is None else at_the_likeliest_place(rules, winner, worthy)
 

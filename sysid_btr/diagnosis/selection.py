@@ -12,7 +12,9 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.prior import is_implausible
 from sysid_btr.identify.refit import Fitted, paired_t
+from sysid_btr.terms.base import Term
 
 
 @dataclass(frozen=True, repr=False)
@@ -306,6 +308,26 @@ def explains_fitted(rules: Selection, before: Fitted, after: Fitted) -> bool:
     return bool(np.any(whole)) and after.holdout < (1 + rules.whole_harm) * before.holdout
 
 
+def relieves(rules: Selection, without: Fitted, now: Fitted) -> bool:
+    """Whether an effect spares a model implausible numbers, and is none of these itself.
+
+    A load on a body whose mass is free is that mass.
+    """
+    if not is_implausible(without.off):
+        return False
+    stated = {place for t in without.model.terms if _is_stated(t) for place in t.places}
+    known = {(t.called, t.places) for t in without.model.terms}
+    added = {place for t in now.model.terms if (t.called, t.places) not in known for place in t.places}
+    before, after = (float(m.train_cells.sum() + m.off @ m.off) for m in (without, now))
+    harmless = now.holdout < (1 + rules.whole_harm) * without.holdout
+    return harmless and before - after >= rules.candidate_gain and not stated & added
+
+
+def _is_stated(term: Term) -> bool:
+    """Whether a model states something of all that robots have of a term's parameters."""
+    return all(np.isfinite(p.spread) for p in term.parameters)
+
+
 def is_needed(rules: Selection, without: Fitted, now: Fitted, *, transient: bool = False) -> bool:
     """Whether data are predicted worse without an effect, by any of the ways in which one is added.
 
@@ -314,6 +336,7 @@ def is_needed(rules: Selection, without: Fitted, now: Fitted, *, transient: bool
     return (
         improves(rules, without, now)
         or explains_fitted(rules, without, now)
+        or relieves(rules, without, now)
         or (transient and improves_once(rules, without, now))
     )
 

@@ -45,7 +45,8 @@ def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection,
         short = shorten(study, rules.refit_seconds)
         found = refit(short, Model(terms, start), judged=study, iterations=rules.first_iterations)
         spent += found.evaluations + len(starts)
-        if not (found.converged or at_floor(rules, found) or _is_behind(rules, found, among)):
+        floor = at_floor(rules, found) and not study.held
+        if not (found.converged or floor or _is_behind(rules, found, among)):
             found = refit(short, found.model, judged=study)
             spent += found.evaluations
         finer = study.numerics.halved()

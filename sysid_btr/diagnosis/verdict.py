@@ -12,6 +12,7 @@ from sysid_btr.diagnosis.selection import Selection, differs_from, is_log_explai
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
 from sysid_btr.identify.intervals import Estimate
+from sysid_btr.identify.prior import doubt
 from sysid_btr.identify.refit import Fitted, judge
 from sysid_btr.identify.scores import score
 from sysid_btr.models.robot import channel_units
@@ -51,12 +52,13 @@ def conclude(state: State, verdict: Verdict, named: Sequence[NamedEffect], rules
     nearest = score(study, reported.model)
     # what is reported and written is one state: without a named effect, that of the fit
     after, estimates = (nearest, state.estimates) if kept else (first.before, first.estimates)
+    alone = doubt(first.model.terms.parameters, first.values)
     channel = study.leading_channel
     unit = channel_units(study.robot)[channel].partition(",")[0]
     return Closing(
         study=study if kept else first.study,
         verdict=verdict,
-        message=message_of(verdict, named, first.before, nearest, left, channel, unit),
+        message=message_of(verdict, named, first.before, nearest, left, channel, unit, alone),
         noise_floor={c: s.floor for c, s in first.before.holdout.items()},
         nominal=first.nominal,
         before=first.before,

@@ -24,6 +24,7 @@ from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import Estimate, Profile, estimates, held_to_model
 from sysid_btr.identify.nuisance import assumptions, check_nuisance, error_of_the_rest
 from sysid_btr.identify.outcome import StudyOutcome
+from sysid_btr.identify.prior import doubt
 from sysid_btr.identify.recorder import as_recorded
 from sysid_btr.identify.scores import Misfit, Scores, misfit_of, score
 from sysid_btr.identify.sensitivity import with_sensitivity
@@ -99,6 +100,8 @@ class Fit(StudyOutcome):
             first, last, floor = si_all([nominal.rmse, before.rmse, before.floor], unit)
             goes = "rises" if before.rmse > RISES * nominal.rmse else "goes"
             parts.append(f"the held-out {channel} error {goes} from {first} to {last}, with a noise floor of {floor}")
+        if implausible := doubt(self.model.terms.parameters, self.values):
+            parts.append(implausible)
         if not self.result.converged:
             parts.append("the fit did not converge")
         return "; ".join(parts) + "."

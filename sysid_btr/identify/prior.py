@@ -15,6 +15,9 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.base import Parameter
 from sysid_btr.terms.model import Terms
 
+SURPRISING = 1e-4
+"""Probability, if a model states what robots have, of numbers at least as far off as those that are not believed."""
+
 
 class Belief(Protocol):
     """What is known of parameters: normal, in independent directions."""
@@ -47,6 +50,35 @@ class Stated:
         """See `Belief.whitened`: one direction for each parameter of which a model states something."""
         known = self.weight > 0
         return np.asarray((candidates[:, known] - self.nominal[known]) * self.weight[known])
+
+
+def is_implausible(off: FloatArray) -> bool:
+    """Whether numbers (s,), in spreads of robots from what a model states, are further off than chance lets them be.
+
+    A prior-data conflict (Evans and Moshonov 2006, doi:10.1214/06-BA129): what asks for such numbers lacks something.
+    """
+    from scipy.special import gammaincc
+
+    return bool(len(off) and gammaincc(len(off) / 2, float(off @ off) / 2) < SURPRISING)
+
+
+def implausible(parameters: Sequence[Parameter], values: FloatArray) -> tuple[str, ...]:
+    """Names of parameters whose values (p,) are more than twice as far off as robots are, if all are implausible."""
+    stated = Stated.of(parameters)
+    off = stated.whitened(values[None])[0]
+    known = [p.name for p, weight in zip(parameters, stated.weight, strict=True) if weight > 0]
+    return tuple(name for name, far in zip(known, np.abs(off) > 2, strict=True) if far) if is_implausible(off) else ()
+
+
+def doubt(parameters: Sequence[Parameter], values: FloatArray) -> str:
+    """What is to be said of values (p,) that robots do not have; empty where they are plausible."""
+    names = implausible(parameters, values)
+    if not names:
+        return ""
+    amounts = dict(zip((p.name for p in parameters), values.tolist(), strict=True))
+    listing = ", ".join(f"{name} {amounts[name]:.2g}" for name in names)
+    are, them = ("are", "them") if len(names) > 1 else ("is", "it")
+    return f"{listing} {are} further from the model than robots are: something that acts like {them} may be missing"
 
 
 @dataclass(frozen=True, eq=False)

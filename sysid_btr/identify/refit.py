@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,6 +51,7 @@ class Fitted:
     train_counts, holdout_counts : (columns, stretches) number of samples.
     evaluations : candidates simulated.
     numerics : with which it was judged.
+    off : (s,) by how many spreads of robots parameters are off what the model states, if that counts; else empty.
     converged : whether its parameters are where least squares lead, as far as that was asked for.
     """
 
@@ -68,6 +69,7 @@ class Fitted:
     holdout_counts: FloatArray
     evaluations: int
     numerics: Numerics
+    off: FloatArray = field(default_factory=lambda: np.zeros(0))
     converged: bool = False
 
     @property
@@ -223,6 +225,7 @@ def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:
         holdout_counts=holdout_counts,
         evaluations=evaluations + 1,
         numerics=study.numerics,
+        off=Stated.of(model.terms.parameters).whitened(model.values[None])[0] if study.redundancy else np.zeros(0),
     )
 
 
@@ -244,7 +247,7 @@ def inflate(study: Study, fitted: Fitted, *, memory: bool = False) -> Study:
     problem = study.train_problem(fitted.model)
     wrong = fitted.train_columns > CORRELATED
     length = np.where(wrong, fitted.memory, 1.0)
-    redundancy = 0.0 if not wrong.any() else problem.count / float(np.sum(problem.counts / length))
+    redundancy = float(study.held) if not wrong.any() else problem.count / float(np.sum(problem.counts / length))
     worst: dict[tuple[str, str, str], float] = {}
     for chi2, own, (i, target, k) in zip(fitted.train_columns, length, problem.columns, strict=True):
         key = (problem.episodes[i].replay.log.meta.mount, target.channel, target.joints[k])

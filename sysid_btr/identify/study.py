@@ -59,6 +59,7 @@ class Study:
     independent : whether `inflation` lets each column count as its independent samples do.
     redundancy : residuals that say as much as one that is independent of the others, where the model leaves more than
         noise; 0 where it leaves noise alone, beside which what robots have from their models says nothing.
+    held : whether that says something beside noise, too: the log alone asks for numbers that robots do not have.
     nuisance : FIELD or FIELD:GLOB -> standard deviation of its numbers where they are not fitted, for the intervals.
     executor : where candidates are simulated.
     journal : record of refits, from which an interrupted search goes on; None keeps none.
@@ -77,10 +78,15 @@ class Study:
     nuisance: Mapping[str, float] = field(default_factory=dict)
     independent: bool = False
     redundancy: float = 0.0
+    held: bool = False
 
     def __repr__(self) -> str:
         parts = f"{len(self.train)} episodes fitted, {len(self.holdout)} held out"
         return f"<Study of {self.robot.name}: {parts}; {', '.join(self.channels)}; {self.numerics}>"
+
+    def held_to_model(self) -> Study:
+        """The same, where what a model states counts beside noise."""
+        return replace(self, held=True, redundancy=1.0)
 
     @property
     def leading_channel(self) -> str:
