@@ -25,6 +25,10 @@ SERVO_MARGIN = 0.05
 """... and mean decrease of log chi2 for which the one that takes longer is."""
 STIFFER = (0.6, 0.35, 0.25)
 """Contact time constants tried first, as factors of the nominal."""
+SHARES = (1.0, 0.5, 0.25, 0.125)
+"""Of the way to a refitted model, of which the first is gone that leaves no more."""
+LEAVES_MORE = 1.01
+"""Ratio of what a turn leaves to what the one before left, from which it is not taken."""
 
 
 def weigh_columns(study: Study, model: Model, budget: Budget, progress: Progress = silent) -> tuple[Study, Fitted]:
@@ -90,9 +94,8 @@ def first_fit(study: Study, model: Model, budget: Budget, progress: Progress = s
         if procedure.shares:
             study = study.with_share(procedure.shares[turn - 1], model)
         found = refit(study, model, iterations=iterations, budget=budget.after(spent), progress=progress)
-        model, spent = found.model, spent + found.evaluations
-        last = turn == len(procedure.alternations)
-        study = study.with_initial_states(model, held_out=last, anew=last)
+        spent += found.evaluations
+        study, model = _turned(study, model, found.model, last=turn == len(procedure.alternations))
     model, more = without_unreached_limits(study, model)
     study, spent = replace(study, numerics=reference), spent + more
     if all(episode.procedure.coarse_suffices for episode in study.train):
@@ -100,6 +103,28 @@ def first_fit(study: Study, model: Model, budget: Budget, progress: Progress = s
     # what the cheap integrator does wrong is much beside the noise of a robot that hangs, and is no error of its model
     right = refit(study, model, budget=budget.after(spent), progress=progress)
     return study, replace(right, evaluations=right.evaluations + spent)
+
+
+def _turned(study: Study, model: Model, found: Model, *, last: bool) -> tuple[Study, Model]:
+    """The study with the states that a refitted model wants, and that model, or one between it and the one before.
+
+    Each is the best beside what the other was, and both together may leave more than before: where a joint that rubs is
+    believed to stick, other states are likely.
+    """
+    before = np.nan_to_num(_left(study, model), nan=np.inf)
+    for share in SHARES:
+        there = model.at(model.values + share * (found.values - model.values))
+        turned = study.with_initial_states(there, held_out=last, anew=last)
+        if not before < np.inf or _left(turned, there) <= LEAVES_MORE * before:
+            return turned, there
+    return study, model
+
+
+def _left(study: Study, model: Model) -> float:
+    """Mean square of the fitted error over the noise floor."""
+    problem = replace(study, inflation={}).train_problem(model)
+    chi2 = problem.column_chi2(problem.residuals(model.values[None])[0])
+    return float(np.average(chi2, weights=problem.counts))
 
 
 def contact_starts(model: Model) -> FloatArray:
