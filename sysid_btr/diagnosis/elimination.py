@@ -27,6 +27,7 @@ from sysid_btr.diagnosis.trials import Trial, attempt, is_wanted
 from sysid_btr.diagnosis.uncertainty import with_intervals
 from sysid_btr.estimators.base import Progress, without_loss
 from sysid_btr.estimators.linearisation import linearise
+from sysid_btr.identify.coarse import LEAVES_MORE
 from sysid_btr.identify.refit import Fitted, inflate, refit
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.covariance import covariance
@@ -36,9 +37,6 @@ Wanted = Callable[[Selection, Fitted, Fitted], bool]
 """Whether data want what the first model lacks of the second."""
 SETTLED = 0.5
 """Standard errors by which a turn of initial states and parameters moves these when it is the last."""
-LEAVES_MORE = 1.01
-"""Ratio of what a turn leaves to what the one before left, from which it is not taken: turns minimise nothing together,
-and may wander off to where friction is at one joint what it was at two."""
 
 
 def eliminate(state: State, library: Library, rules: Selection, progress: Progress) -> State:
@@ -65,7 +63,10 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
 
 
 def _states_in_turn(state: State) -> State:
-    """Initial states, which were those of a model that lacked its last effect, and parameters in turn."""
+    """Initial states, which were those of a model that lacked its last effect, and parameters in turn.
+
+    Turns minimise nothing together: they may wander off to where friction is at one joint what it was at two.
+    """
     for _ in range(state.study.procedure.last_turns):
         study = inflate(state.study.with_initial_states(state.fitted.model, anew=False), state.fitted)
         again, before = refit(study, state.fitted.model), state.fitted
