@@ -240,7 +240,7 @@ def exactness(result: Mapping[str, Any]) -> Iterator[str]:
         fields = ", ".join(dict.fromkeys(p["name"].partition(":")[0] for p in held))
         share = number(100 * held[0]["prior_std"] / held[0]["nominal"], 2)
         yield (
-            f"since the model leaves more than noise, {fields} was taken to be what the model states, give or take "
+            f"beside what the log says, {fields} was taken to be what the model states, give or take "
             f"{share} % (one standard deviation); --bounds states otherwise"
         )
     if allowed:

@@ -101,7 +101,7 @@ class Fit(StudyOutcome):
             goes = "rises" if before.rmse > RISES * nominal.rmse else "goes"
             parts.append(f"the held-out {channel} error {goes} from {first} to {last}, with a noise floor of {floor}")
         if implausible := doubt(self.model.terms.parameters, self.values):
-            parts.append(implausible)
+            parts.append(f"{implausible} (`sysid-btr close` looks for it)")
         if not self.result.converged:
             parts.append("the fit did not converge")
         return "; ".join(parts) + "."
