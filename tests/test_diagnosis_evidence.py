@@ -223,6 +223,9 @@ def test_what_a_model_states_is_evidence_beside_the_data() -> None:
     np.testing.assert_allclose(weights([far, near], alike, [0, 0]), odds / odds.sum())
     assert left_where_it_acts(far, near) == pytest.approx(1 / 3)  # of a mean square of 4, 2 is left: 1 of 3 above 1
     assert left_where_it_acts(replace(alike, off=np.array([5.0])), replace(alike, off=np.array([0.5]))) == 0.0
+    # where it counts beside one model and not beside another they cannot be compared by it
+    np.testing.assert_allclose(weights([far, alike], alike, [0, 0]), 0.5)
+    assert left_where_it_acts(far, alike) == 1.0
 
 
 def test_what_is_left_counts_where_the_effect_acts() -> None:

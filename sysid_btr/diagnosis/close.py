@@ -101,7 +101,9 @@ def close(
         if later is None:
             return conclude(state, verdict, named, selection, perf_counter() - began)
         # what is missing shows only after the fitted part: fit more of the log, hold out what is left
-        study = replace(later, numerics=first.study.numerics, inflation={}, independent=False, redundancy=0.0)
+        study = replace(
+            later, numerics=first.study.numerics, inflation={}, independent=False, redundancy=0.0, held=False
+        )
         journal = later.journal and later.journal.section()
 
 

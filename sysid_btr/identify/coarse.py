@@ -25,7 +25,7 @@ SERVO_MARGIN = 0.05
 """... and mean decrease of log chi2 for which the one that takes longer is."""
 STIFFER = (0.6, 0.35, 0.25)
 """Contact time constants tried first, as factors of the nominal."""
-SHARES = (1.0, 0.5, 0.25, 0.125)
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
 """Of the way to a refitted model, of which the first is gone that leaves no more."""
 LEAVES_MORE = 1.01
 """Ratio of what a turn leaves to what the one before left, from which it is not taken."""
@@ -111,13 +111,13 @@ def _turned(study: Study, model: Model, found: Model, *, last: bool) -> tuple[St
     Each is the best beside what the other was, and both together may leave more than before: where a joint that rubs is
     believed to stick, other states are likely.
     """
-    before = np.nan_to_num(_left(study, model), nan=np.inf)
+    before = _left(study, model)
     for share in SHARES:
         there = model.at(model.values + share * (found.values - model.values))
         turned = study.with_initial_states(there, held_out=last, anew=last)
-        if not before < np.inf or _left(turned, there) <= LEAVES_MORE * before:
-            return turned, there
-    return study, model
+        if not np.isfinite(before) or _left(turned, there) <= LEAVES_MORE * before:
+            break
+    return turned, there
 
 
 def _left(study: Study, model: Model) -> float:
