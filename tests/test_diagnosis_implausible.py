@@ -47,7 +47,7 @@ def carrying(load: float, masses: tuple[float, ...], seed: int) -> Closing:
     return close(make_study(robot, [log], threads=1), FREED)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_load_that_masses_imitate_is_named_with_what_it_is_confounded_with(seed: int) -> None:
     found = carrying(0.25, (1.0, 1.0, 1.0), seed)
     # alone, the masses explain the log
