@@ -44,8 +44,8 @@ TASK, NAO = Walk(16.0), load_robot("nao")
 PARTS = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
 STEP = 2.5e-4
 """s, of Drake's steps, which are of first order and act like a latency of half of one."""
-DAMPING_TIME = 0.02
-"""s, kv over kp of the Nao's servos."""
+DAMPING_TIME = float(np.median(-NAO.model.actuator_biasprm[:, 2] / NAO.model.actuator_gainprm[:, 0]))
+"""s, kv over kp of the servos, of all the same."""
 CONTACT = "contact"
 TRIES = 50
 

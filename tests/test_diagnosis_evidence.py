@@ -218,11 +218,16 @@ def test_weights_are_a_distribution_and_do_not_depend_on_the_order(chi2: list[fl
 
 def test_what_a_model_states_is_evidence_beside_the_data() -> None:
     alike = left(even(1.0))
-    far, near = replace(alike, off=np.array([2.0, 2.0])), replace(alike, off=np.array([0.0, 2.0]))
+    far, near = replace(alike, prior_residual=np.array([2.0, 2.0])), replace(alike, prior_residual=np.array([0.0, 2.0]))
     odds = np.exp(-0.5 * np.array([8.0, 4.0]))
     np.testing.assert_allclose(weights([far, near], alike, [0, 0]), odds / odds.sum())
     assert left_where_it_acts(far, near) == pytest.approx(1 / 3)  # of a mean square of 4, 2 is left: 1 of 3 above 1
-    assert left_where_it_acts(replace(alike, off=np.array([5.0])), replace(alike, off=np.array([0.5]))) == 0.0
+    assert (
+        left_where_it_acts(
+            replace(alike, prior_residual=np.array([5.0])), replace(alike, prior_residual=np.array([0.5]))
+        )
+        == 0.0
+    )
     # where it counts beside one model and not beside another they cannot be compared by it
     np.testing.assert_allclose(weights([far, alike], alike, [0, 0]), 0.5)
     assert left_where_it_acts(far, alike) == 1.0

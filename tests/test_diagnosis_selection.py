@@ -320,7 +320,7 @@ def far(off: float, loss: float = 1000.0, holdout: float = 1.0, effect: Effect |
     """A fit of the mass of a knee that is so many of robots' spreads off, perhaps beside an effect."""
     model = Model.of((Mass(("knee",)), *((effect,) if effect else ())))
     cells = np.full((1, 4), loss / 4)
-    return replace(fitted([holdout], model=model), train_cells=cells, off=np.array([off]))
+    return replace(fitted([holdout], model=model), train_cells=cells, prior_residual=np.array([off]))
 
 
 LOAD = Payload(("hip",))

@@ -126,7 +126,11 @@ def weights(models: Sequence[Fitted], best: Fitted, parameters: Sequence[int]) -
     parameters : (m,) that each has beside what all have; each costs as much as it gains by chance (Akaike 1974).
     """
     density = np.stack([np.concatenate([_fitted_density(m, best), _heldout_density(m, best)]) for m in models])
-    believed = [0.5 * float(m.off @ m.off) for m in models] if all(len(m.off) for m in models) else [0.0]
+    believed = (
+        [0.5 * float(m.prior_residual @ m.prior_residual) for m in models]
+        if all(len(m.prior_residual) for m in models)
+        else [0.0]
+    )
     return _shares(density, np.asarray(parameters, dtype=np.float64) + np.array(believed))
 
 
@@ -161,8 +165,8 @@ def left_where_it_acts(without: Fitted, now: Fitted) -> float:
 
     Columns count by how much the effect improves their predictive density, and so does what the model states.
     """
-    stated = len(without.off) and len(now.off)
-    before, after = (np.append(m.columns, [np.mean(m.off**2)] if stated else []) for m in (without, now))
+    stated = len(without.prior_residual) and len(now.prior_residual)
+    before, after = (np.append(m.columns, [np.mean(m.prior_residual**2)] if stated else []) for m in (without, now))
     gain = np.maximum(before - after, 0.0)
     left = np.maximum(after - 1, 0.0)
     weight = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))

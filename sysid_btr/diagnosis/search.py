@@ -37,7 +37,7 @@ from sysid_btr.diagnosis.trials import (
 )
 from sysid_btr.estimators.base import Budget, Progress
 from sysid_btr.identify.bounds import fit_beyond
-from sysid_btr.identify.prior import Stated, is_implausible
+from sysid_btr.identify.prior import is_implausible, prior_residual
 from sysid_btr.identify.recorder import as_recorded, own_steps
 from sysid_btr.identify.refit import refit, robust_refit
 from sysid_btr.progress import phase
@@ -65,7 +65,7 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
     for number in range(1, rules.rounds + 1):
         state = _held_to_model(state)
         enough = at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted)
-        enough = enough and not is_implausible(state.fitted.off)
+        enough = enough and not is_implausible(state.fitted.prior_residual)
         if enough or not could_gain(rules, state.before, state.fitted):
             break
         if number == OWN_STEPS_FROM:
@@ -116,12 +116,12 @@ def _held_to_model(state: State) -> State:
 
     What is missing may be imitated by these down to the noise.
     """
-    alone = Stated.of(state.fitted.model.terms.parameters).whitened(state.fitted.model.values[None])[0]
-    if state.study.redundancy or not is_implausible(alone):
+    model = state.fitted.model
+    if state.study.redundancy or not is_implausible(prior_residual(model.terms.parameters, model.values)):
         return state
     study = state.study.held_to_model()
-    fitted = refit(study, state.fitted.model)
-    held = replace(state, study=study, fitted=fitted) if is_implausible(fitted.off) else state
+    fitted = refit(study, model)
+    held = replace(state, study=study, fitted=fitted) if is_implausible(fitted.prior_residual) else state
     return held.spent(fitted.evaluations)
 
 

@@ -313,12 +313,12 @@ def relieves(rules: Selection, without: Fitted, now: Fitted) -> bool:
 
     A load on a body whose mass is free is that mass.
     """
-    if not is_implausible(without.off):
+    if not is_implausible(without.prior_residual):
         return False
     stated = {place for t in without.model.terms if _is_stated(t) for place in t.places}
     known = {(t.called, t.places) for t in without.model.terms}
     added = {place for t in now.model.terms if (t.called, t.places) not in known for place in t.places}
-    before, after = (float(m.train_cells.sum() + m.off @ m.off) for m in (without, now))
+    before, after = (float(m.train_cells.sum() + m.prior_residual @ m.prior_residual) for m in (without, now))
     harmless = now.holdout < (1 + rules.whole_harm) * without.holdout
     return harmless and before - after >= rules.candidate_gain and not stated & added
 

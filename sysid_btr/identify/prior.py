@@ -52,22 +52,28 @@ class Stated:
         return np.asarray((candidates[:, known] - self.nominal[known]) * self.weight[known])
 
 
-def is_implausible(off: FloatArray) -> bool:
-    """Whether numbers (s,), in spreads of robots from what a model states, are further off than chance lets them be.
+def prior_residual(parameters: Sequence[Parameter], values: FloatArray) -> FloatArray:
+    """By how many spreads of robots those (s,) of some values (p,) of which a model states something are off that."""
+    return np.asarray(Stated.of(parameters).whitened(values[None])[0])
+
+
+def is_implausible(residual: FloatArray) -> bool:
+    """Whether a prior residual (s,) is larger than chance lets it be.
 
     A prior-data conflict (Evans and Moshonov 2006, doi:10.1214/06-BA129): what asks for such numbers lacks something.
     """
     from scipy.special import gammaincc
 
-    return bool(len(off) and gammaincc(len(off) / 2, float(off @ off) / 2) < SURPRISING)
+    return bool(len(residual) and gammaincc(len(residual) / 2, float(residual @ residual) / 2) < SURPRISING)
 
 
 def implausible(parameters: Sequence[Parameter], values: FloatArray) -> tuple[str, ...]:
     """Names of parameters whose values (p,) are more than twice as far off as robots are, if all are implausible."""
-    stated = Stated.of(parameters)
-    off = stated.whitened(values[None])[0]
-    known = [p.name for p, weight in zip(parameters, stated.weight, strict=True) if weight > 0]
-    return tuple(name for name, far in zip(known, np.abs(off) > 2, strict=True) if far) if is_implausible(off) else ()
+    residual = prior_residual(parameters, values)
+    if not is_implausible(residual):
+        return ()
+    stated = [p.name for p in parameters if np.isfinite(p.spread)]
+    return tuple(name for name, far in zip(stated, np.abs(residual) > 2, strict=True) if far)
 
 
 def doubt(parameters: Sequence[Parameter], values: FloatArray) -> str:

@@ -13,7 +13,7 @@ from sysid_btr.estimators.evaluator import Evaluator, Stop
 from sysid_btr.estimators.journal import Journal
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.identify.deferred import LEAST_GAIN, deferred_fit
-from sysid_btr.identify.prior import Stated
+from sysid_btr.identify.prior import Stated, prior_residual
 from sysid_btr.identify.study import Study
 from sysid_btr.objectives.problem import ReplayProblem, of_both
 from sysid_btr.simulation.numerics import Numerics
@@ -51,7 +51,7 @@ class Fitted:
     train_counts, holdout_counts : (columns, stretches) number of samples.
     evaluations : candidates simulated.
     numerics : with which it was judged.
-    off : (s,) by how many spreads of robots parameters are off what the model states, if that counts; else empty.
+    prior_residual : (s,) of `sysid_btr.identify.prior`, if what the model states counts; else empty.
     converged : whether its parameters are where least squares lead, as far as that was asked for.
     """
 
@@ -69,7 +69,7 @@ class Fitted:
     holdout_counts: FloatArray
     evaluations: int
     numerics: Numerics
-    off: FloatArray = field(default_factory=lambda: np.zeros(0))
+    prior_residual: FloatArray = field(default_factory=lambda: np.zeros(0))
     converged: bool = False
 
     @property
@@ -225,7 +225,7 @@ def judge(study: Study, model: Model, evaluations: int = 0) -> Fitted:
         holdout_counts=holdout_counts,
         evaluations=evaluations + 1,
         numerics=study.numerics,
-        off=Stated.of(model.terms.parameters).whitened(model.values[None])[0] if study.redundancy else np.zeros(0),
+        prior_residual=prior_residual(model.terms.parameters, model.values) if study.redundancy else np.zeros(0),
     )
 
 
