@@ -29,6 +29,7 @@ from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.intervals import estimates
 from sysid_btr.identify.mode import Mode
 from sysid_btr.identify.replay import replay_log
+from sysid_btr.identify.scores import score
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import NoiseFloor
@@ -45,6 +46,7 @@ from sysid_btr.terms.disturbance import ConstantForce
 from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.inertial import GravityTilt
+from sysid_btr.terms.model import Model
 from sysid_btr.terms.servo import CommandDelay
 from sysid_btr.testing.problems import ToyProblem
 
@@ -371,6 +373,13 @@ def test_masses_on_a_walk_lie_within_their_intervals() -> None:
     for estimate in heavy_fit().estimates:
         low, high = estimate.ci95
         assert low <= HEAVY[estimate.name] <= high, estimate
+
+
+def test_the_plain_model_is_judged_from_the_initial_states_that_it_wants_itself() -> None:
+    found, given = heavy_fit(), heavy_study()
+    alone = score(replace(given, numerics=found.study.numerics), Model.of(()))
+    for part, own in ((found.nominal.train, alone.train), (found.nominal.holdout, alone.holdout)):
+        assert own["position"].chi2 == pytest.approx(part["position"].chi2, rel=1e-6)
 
 
 def test_the_ground_reaches_the_bodies_that_carry_the_base() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -177,7 +177,7 @@ def fit(
     Fit
         Parameters that are not identifiable are fixed at their nominal value and marked.
     """
-    began = perf_counter()
+    began, given = perf_counter(), study
     check_nuisance(study.robot, study.nuisance)
     terms = as_terms(study, parameters)
     if not terms.parameters:
@@ -219,6 +219,8 @@ def fit(
             values, found, spent = fix_unidentifiable(goal, values, found, jacobian, known, left)
             replays += spent
     before = score(study, model.at(values))
+    # from the initial states that it wants itself, not from the fitted model's
+    nominal = score(replace(study, train=given.train, holdout=given.holdout), Model.of(terms))
     if misfit_of(before.train, study.leading_channel, study.procedure.tolerated) is not None:
         found = widened(found, problem, at.values, jacobian, residual, study.scales)
     if solved.by_residuals and known is None and study.redundancy:
@@ -227,7 +229,7 @@ def fit(
         study=study,
         model=model.at(values),
         estimates=with_sensitivity(found, at.problem, at.jacobian),
-        nominal=score(study, Model.of(terms)),
+        nominal=nominal,
         before=before,
         result=solved.result,
         numerics_shift=shift,
