@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
@@ -127,8 +128,10 @@ def test_states_and_forces_are_integrated_out_as_a_dense_solver_does() -> None:
 
     cost = float(found.left[:, 0] @ found.left[:, 0])
     assert cost == pytest.approx(float(rest @ left(rest)), rel=1e-6)
-    np.testing.assert_allclose(found.information, by.T @ left(by), rtol=1e-5, atol=1e-8 * np.abs(by.T @ by).max())
-    np.testing.assert_allclose(found.gradient, by.T @ left(rest), rtol=1e-4, atol=1e-6 * np.abs(by.T @ rest).max())
+    own = found.left[:, 1:]
+    np.testing.assert_allclose(own.T @ own, by.T @ left(by), rtol=1e-5, atol=1e-8 * np.abs(by.T @ by).max())
+    own = own.T @ found.left[:, 0]
+    np.testing.assert_allclose(own, by.T @ left(rest), rtol=1e-4, atol=1e-6 * np.abs(by.T @ rest).max())
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +179,46 @@ def test_masses_come_out_whatever_the_ground_is(on_springs: OnSprings) -> None:
     for e, mean, own in zip(told, found.mean, std, strict=True):
         assert e.std <= 1.001 * own
         assert abs(e.value - mean) < own
+
+
+@pytest.mark.parametrize("start", [(1.0, 0.0001), (125.0, 0.009)])
+def test_the_likeliest_slack_and_jolts_are_found_from_afar(start: tuple[float, float], on_springs: OnSprings) -> None:
+    _, _, problem, values = on_springs
+    replay = problem.episodes[0].replay
+    assert isinstance(replay, FloatingReplay)
+    chain = chain_module.chain_of(replay)
+    known = chain_module.derive(chain, values)
+    ends = chain_module.simulate_chain(chain, values, np.arange(0), np.zeros(0))
+    found = chain_module.linearise_chain(chain, known, ends)
+    chain = chain_module.moved_chain(chain, known, found, np.zeros(1))
+    free = np.arange(2)
+    ends = chain_module.simulate_chain(chain, values, free, 0.02 * (problem.upper - problem.lower)[free])
+
+    def surprise(slack: float, jolt: float) -> float:
+        found = chain_module.linearise_chain(replace(chain, slack=slack, jolt=jolt), known, ends)
+        best = np.linalg.lstsq(found.left[:, 1:], found.left[:, 0])[0]
+        return found.surprise - float(found.left[:, 0] @ found.left[:, 1:] @ best)
+
+    slack = min(chain_module.SLACKS, key=lambda tried: surprise(tried, start[1]))
+    wanted = slack, min(chain_module.JOLTS, key=lambda tried: surprise(slack, tried))
+    chain = replace(chain, slack=start[0], jolt=start[1])
+    likeliest = chain_module.likeliest(chain, known, ends, chain_module.SLACKS)
+    assert (likeliest.slack, likeliest.jolt) == wanted
+
+
+def test_a_long_walk_tells_them_by_stretches_spread_over_it(on_springs: OnSprings) -> None:
+    replay = on_springs[2].episodes[0].replay
+    assert isinstance(replay, FloatingReplay)
+    chain = chain_module.chain_of(replay)
+    assert chain_module.stretches(chain) == [(0, len(chain.time))]
+    long = replace(chain, time=np.arange(6001) * 0.02)
+    rows = chain_module.stretches(long)
+    assert rows[0][0] == 0
+    assert rows[-1][1] == len(long.time)
+    (length,) = {stop - start for start, stop in rows}
+    assert 0.02 * length == pytest.approx(chain.size.time(chain_module.STRETCH), abs=0.02)
+    assert all(stop < start for (_, stop), (start, _) in pairwise(rows))
+    assert chain_module.SHOWING <= length * len(rows) < chain_module.SHOWING + length
 
 
 def test_a_model_that_lacks_something_else_is_contradicted() -> None:

@@ -8,9 +8,9 @@ Lengths, times and speeds below are the Nao's; `BodySize` makes them those of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,6 +71,9 @@ NUDGE_FORCE, NUDGE_TORQUE = 5.0, 0.5
 """... and of forces, N, and torques, Nm."""
 SMALL = 0.1
 """... where nothing sticks: fractions of these, so that what bends within them does not count."""
+STRETCH, SHOWING = 4.0, 800
+"""s of each of the stretches of a walk that tell how large slack and jolts are, and samples of all of them together.
+Sizes are some times one another: less than a long log tells them."""
 STALE = 0.2
 """Error of a change of state that derivatives may predict, fractions of `NUDGE`."""
 NUDGE_NUMBER = 0.02
@@ -269,6 +272,10 @@ class Ends:
     defect: FloatArray
     by_number: FloatArray
 
+    def part(self, start: int, stop: int) -> Ends:
+        """Those of the steps between the samples from `start` to before `stop`."""
+        return Ends(self.defect[start : stop - 1], self.by_number[start : stop - 1])
+
 
 @dataclass(frozen=True, eq=False)
 class Round:
@@ -288,14 +295,6 @@ class Round:
     surprise: float
     move: FloatArray
     ends: Ends
-
-    @property
-    def information(self) -> FloatArray:
-        return np.asarray(self.left[:, 1:].T @ self.left[:, 1:])
-
-    @property
-    def gradient(self) -> FloatArray:
-        return np.asarray(self.left[:, 1:].T @ self.left[:, 0])
 
 
 def suits(replay: FloatingReplay) -> bool:
@@ -587,17 +586,43 @@ def simulate_chain(chain: Chain, values: FloatArray, free: IntArray, step: Float
 
 
 def likeliest(chain: Chain, known: Derivatives, ends: Ends, slacks: Sequence[float] = (1.0,)) -> Chain:
-    """The chain with the slack, and then the size of jolts, that make its log likeliest."""
+    """The chain with the slack, and then the size of jolts, that make its log likeliest, as parts of it show."""
+    parts = [(chain.part(*rows), known.part(*rows), ends.part(*rows)) for rows in stretches(chain)]
 
-    def surprise(tried: Chain) -> float:
-        found = linearise_chain(tried, known, ends)
+    @cache
+    def surprise(slack: float, jolt: float) -> float:
+        rounds = [linearise_chain(replace(c, slack=slack, jolt=jolt), d, e) for c, d, e in parts]
+        left = np.concatenate([r.left for r in rounds])
         # at the numbers that suit it best: those of the start may be far off
-        best = np.linalg.lstsq(found.left[:, 1:], found.left[:, 0], rcond=1e-9)[0]
-        return found.surprise - float(found.gradient @ best)
+        best = np.linalg.lstsq(left[:, 1:], left[:, 0], rcond=1e-9)[0]
+        return sum(r.surprise for r in rounds) - float(left[:, 0] @ (left[:, 1:] @ best))
 
+    slack, jolt = chain.slack, chain.jolt
     if len(slacks) > 1:
-        chain = min((replace(chain, slack=slack) for slack in slacks), key=surprise)
-    return min((replace(chain, jolt=jolt) for jolt in JOLTS), key=surprise)
+        slack = _lowest(slacks, slack, lambda tried: surprise(tried, jolt))
+    return replace(chain, slack=slack, jolt=_lowest(JOLTS, jolt, lambda tried: surprise(slack, tried)))
+
+
+def _lowest(sizes: Sequence[float], start: float, surprise: Callable[[float], float]) -> float:
+    """Where a descent from one size to its neighbours ends: a likelihood has one peak over a scale."""
+    at = sizes.index(start)
+    while True:
+        near = [at, *(k for k in (at - 1, at + 1) if 0 <= k < len(sizes))]
+        best = min(near, key=lambda k: surprise(sizes[k]))
+        if best == at:
+            return sizes[at]
+        at = best
+
+
+def stretches(chain: Chain) -> list[tuple[int, int]]:
+    """Stretches spread evenly over a chain, each from a sample to before another; one of all where that is no more."""
+    n, period = len(chain.time), float(chain.time[1])
+    length = max(round(chain.size.time(STRETCH) / period), 2)
+    number, wanted = n // length, -(-SHOWING // length)
+    if number <= wanted:
+        return [(0, n)]
+    first = np.linspace(0, n - length, wanted).astype(np.int64).tolist()
+    return [(start, start + length) for start in first]
 
 
 def linearise_chain(chain: Chain, known: Derivatives, ends: Ends) -> Round:
