@@ -110,8 +110,7 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
     state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
     # where the model states what decides, data show next to nothing of it
     winner = likeliest(trials) if state.study.held else preferred(rules, trials)
-    if winner is not trials[0] and state.study.procedure.wanders and not is_likely(rules, state.fitted, winner, trials):
-        # what is left grows in such a replay, and much would take it up: see `search`
+    if winner is not trials[0] and state.study.procedure.wanders and not is_believed(rules, winner, trials):
         winner = trials[0]
     evidence = evidence_of(rules, winner, trials)
     if winner is trials[0]:
@@ -162,6 +161,16 @@ def _said_of_more(hypothesis: Hypothesis, part: _Part, model: Model) -> bool:
 
 def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:
     return any(h.effect is hypothesis.effect and set(h.places) == set(hypothesis.places) for h in others)
+
+
+def is_believed(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> bool:
+    """Whether a winner takes the place of the first trial also where what is left grows in a replay.
+
+    Much would take that up, see `search`: it must be likely, or predict no worse with fewer numbers.
+    """
+    own = trials[0]
+    simpler = winner.hypothesis.complexity < own.hypothesis.complexity
+    return (simpler and winner.fitted.misfit <= own.fitted.misfit) or is_likely(rules, own.fitted, winner, trials)
 
 
 def preferred(rules: Selection, trials: Sequence[Trial]) -> Trial:
