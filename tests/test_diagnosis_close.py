@@ -378,6 +378,7 @@ PLANTS = [
     Plant(Armature(KNEE), (0.01,)),
     Plant(CommandDelay(toys.LEG_JOINTS, shared=True), (0.025,)),
     Plant(CommandDelaySampled(KNEE), (0.045, 0.02)),
+    Plant(CommandDelaySampled(toys.LEG_JOINTS, shared=True), (0.0411, 0.013)),
     Plant(Backlash(KNEE), (0.03, 0.001)),
     Plant(JointCompliance(KNEE), (0.03,), rivals=("backlash",)),
     Plant(JointSpring(KNEE), (1.0, 0.3), rivals=("encoder_scale",)),

@@ -40,6 +40,7 @@ from sysid_btr.diagnosis.selection import (
 )
 from sysid_btr.diagnosis.split import cut_time
 from sysid_btr.diagnosis.trials import (
+    ADDED,
     Trial,
     candidates_of,
     choose,
@@ -861,6 +862,13 @@ def test_what_did_as_well_and_gives_way_by_convention_is_confused_with_what_is_n
     candidate: Candidate, expected: tuple[str, ...]
 ) -> None:
     assert giving_way(CommandDelay(("knee", "hip")), [candidate]) == expected
+
+
+def test_what_did_as_well_as_another_form_is_not_confused_with_the_one_that_was_added() -> None:
+    pure = Candidate("command_delay", ("hip",), 0.6, 0.1, ("sensor_delay",))
+    sampled = Candidate("command_delay", ("hip",), 0.97, 0.1, (), why=ADDED)
+    for tried in ([sampled, pure], [pure, sampled]):
+        assert giving_way(CommandDelay(("hip",)), tried) == ()
 
 
 # --- where an effect shows only in what was to be held out ------------------------------------------------------------

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis import signal_features
 from sysid_btr.diagnosis.close import usable_effects
-from sysid_btr.diagnosis.proposals import proposals
+from sysid_btr.diagnosis.proposals import by_one_clock, proposals
 from sysid_btr.diagnosis.ringing import blows
 from sysid_btr.diagnosis.scan import Perturbation
 from sysid_btr.diagnosis.signature import signature
@@ -40,7 +40,7 @@ from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Model
-from sysid_btr.terms.servo import sampled
+from sysid_btr.terms.servo import CommandDelaySampled, sampled
 from sysid_btr.terms.transmission import Cogging
 
 NOISE = 4e-4
@@ -173,6 +173,30 @@ def test_cogging_is_proposed_at_its_spatial_frequency() -> None:
     numbers = [q.probe[0][2] for q in found if q.effect is Cogging and q.places == ("hip",)]
     assert numbers
     assert numbers[0] == pytest.approx(31.0, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("clocks", "groups"),
+    [
+        ({"hip": (0.0304, 0.0203), "knee": (0.0305, 0.0101)}, [("hip", "knee"), ("hip", "knee", "ankle")]),
+        ({"hip": (0.0304, 0.0203), "knee": (0.0305, 0.0101), "ankle": (0.041, 0.005)}, [("hip", "knee")]),
+        ({"hip": (0.0304, 0.0203), "knee": (0.041, 0.0203)}, []),
+        ({"hip": (0.0304, 0.0203)}, []),
+    ],
+)
+def test_drives_that_take_commands_at_equal_intervals_are_proposed_together(
+    clocks: dict[str, tuple[float, float]], groups: list[tuple[str, ...]]
+) -> None:
+    """Of commands that are held, moments so far apart are nearly the same: all of them are asked for."""
+    found = [Perturbation(CommandDelaySampled, (joint,), (clock,)) for joint, clock in clocks.items()]
+    together = by_one_clock(found, toys.LEG_JOINTS, step=0.01)
+    assert list(dict.fromkeys(q.places for q in together)) == groups
+    for group in groups:
+        moments = [q.probe[0][1] for q in together if q.places == group]
+        assert {q.probe[0][0] for q in together} == {np.median([period for period, _ in clocks.values()])}
+        for _, start in (clocks["hip"], clocks["knee"]):
+            assert min(abs(start - at) for at in moments) < 1e-9
+            assert min(abs(start + 0.01 - at) for at in moments) < 1e-9 or start + 0.01 > 0.0304
 
 
 def test_only_effects_of_the_library_are_proposed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -35,6 +36,9 @@ WORST = 3
 ONCE_AND_TWICE = (1.0, 2.0)
 """1/rad; an encoder off its centre errs once a turn, one that is bent twice, whatever part of a turn is seen."""
 
+SAME_PERIOD = 0.01
+"""Part of it by which the period of drives may differ that is taken for one: estimates of one differ less."""
+
 Found = Iterator[tuple[type[Effect], Probe]]
 
 
@@ -56,13 +60,36 @@ def proposals(
     torques = missing_torques(problem, values, study.scales)
     worst = max((blame(t) for t in torques), default=0.0)
     loud = sorted((t for t in torques if t.chi2 >= LOUD and blame(t) >= SMALL * worst), key=blame, reverse=True)
-    return [
+    found = [
         Perturbation(effect, (one.joint,), probe)
         for finder, most in wanted
         for one in loud[:most]
         for effect, probe in finder(one, study.scales[one.joint])
         if effect in library and not _within_train(problem, values, one.joint, effect, probe)
     ]
+    step = max((one.period for one in loud), default=0.0)
+    return [*found, *by_one_clock(found, study.robot.names(CommandDelaySampled.scope), step)]
+
+
+def by_one_clock(found: Sequence[Perturbation], drives: Sequence[str], step: float) -> list[Perturbation]:
+    """Drives that seem to take their commands at equal intervals, and all drives, by one clock: one bus may serve them.
+
+    Commands that are held over a `step`, s, are nearly the same at moments that are so far apart, and where a joint
+    alone is looked at, another of these may look better.
+    """
+    own = [q for q in found if q.effect is CommandDelaySampled]
+    if len(own) < 2:
+        return []
+    periods, starts = np.array([q.probe[0] for q in own]).T
+    period = float(np.median(periods))
+    alike = np.abs(periods / period - 1) < SAME_PERIOD
+    groups = [tuple(q.place for q, same in zip(own, alike, strict=True) if same)]
+    if alike.all():
+        groups.append(tuple(drives))
+    later = step * np.arange(math.ceil(period / step))
+    moments = np.mod(starts[alike, None] + later, period).ravel().tolist()
+    several = [group for group in dict.fromkeys(groups) if len(group) > 1]
+    return [Perturbation(CommandDelaySampled, group, ((period, at),)) for group in several for at in moments]
 
 
 def _lines(one: MissingTorque, scale: JointScale) -> Found:

@@ -16,6 +16,7 @@ from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.identify.projection import orthonormal
 from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.subtrees import WHOLE_ROBOT
+from sysid_btr.terms.base import Term
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import Scales, middle_scale, scale_at
@@ -264,6 +265,8 @@ def _simulate(
     for row, job in enumerate(jobs, start=1):
         for i, d in job:
             perturbation = asked[i]
+            gone = _replaced(model, perturbation)
+            candidates[row, gone] = model.terms.nominal[gone]
             for place in perturbation.places:
                 candidates[row, columns[perturbation.effect, place]] = perturbation.probe[d]
     subtree_of_row = wide._subtrees[1]
@@ -297,6 +300,26 @@ def _simulate(
             if answer is not None:
                 own.append(answer)
     return judged
+
+
+def _replaced(model: Model, perturbation: Perturbation) -> IntArray:
+    """Positions of the numbers of what an effect that a probe gives whole takes the place of.
+
+    What it does beside that would be another thing: of commands that come late already, other moments are taken.
+    """
+    effect, places = perturbation.effect, perturbation.places
+    if len(effect.held) < len(effect.kinds):
+        return np.zeros(0, dtype=np.int64)
+    every = np.arange(len(model.values))
+    own = [every[model.terms.columns(t)] for t in model.terms if gives_way(t, effect, places)]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *own])
+
+
+def gives_way(known: Term, effect: type[Effect], places: Sequence[str]) -> bool:
+    """Whether an effect at some places is more general than what is known there, and takes its place."""
+    if not isinstance(known, Effect):
+        return False
+    return (known.label or known.name) in effect.includes and set(known.places) <= set(places)
 
 
 def _judge(

@@ -18,6 +18,9 @@ from sysid_btr.terms.free_form import FREE_FORMS, FreeCurve
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import scale_at
 
+ADDED = "added"
+"""What became of the trial that won its round, see `fate`."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trial:
@@ -317,7 +320,7 @@ def candidates_of(
 def fate(rules: Selection, before: Fitted, trial: Trial, winner: Trial | None) -> str:
     """What became of a trial in its round, and why, in words."""
     if trial is winner:
-        return "added"
+        return ADDED
     if not np.isfinite(trial.fitted.holdout):
         return "its replay diverges"
     if not is_wanted(rules, before, trial):

@@ -11,6 +11,7 @@ from sysid_btr.diagnosis.messages import message_of, sentence_of
 from sysid_btr.diagnosis.selection import Selection, differs_from, is_log_explained, something_left, verdict_limit
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
+from sysid_btr.diagnosis.trials import ADDED
 from sysid_btr.identify.intervals import Estimate
 from sysid_btr.identify.prior import doubt
 from sysid_btr.identify.refit import Fitted, judge
@@ -120,6 +121,8 @@ def _named(
 
 def giving_way(effect: Effect, candidates: Sequence[Candidate]) -> tuple[str, ...]:
     """Effects that did as well at the same locations but give way to this one, by convention."""
-    own = next((c for c in candidates if c.effect == effect.name and set(c.where) == set(effect.places)), None)
+    there = [c for c in candidates if c.effect == effect.name and set(c.where) == set(effect.places)]
+    # of several forms that were tried there, the one that was added last
+    own = next(reversed([*there[:1], *(c for c in there if c.why == ADDED)]), None)
     giving = {e.name for e in select_effects(("all",)) if effect.name in e.yields_to}
     return tuple(name for name in (own.confused_with if own else ()) if name in giving)

@@ -252,6 +252,7 @@ class CommandDelaySampled(Effect):
     variant: ClassVar[str] = "sampled"
     title: ClassVar[str] = "commands taken only at intervals"
     scope: ClassVar = "drive"
+    includes: ClassVar[tuple[str, ...]] = ("command_delay",)
     held: ClassVar[tuple[str, ...]] = ("period", "start")
     kinds: ClassVar[tuple[Kind, ...]] = (
         Kind("period", "s", 0.0, 0.0, 0.2, 0.004),
