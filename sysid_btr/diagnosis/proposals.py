@@ -83,7 +83,8 @@ def by_one_clock(found: Sequence[Perturbation], drives: Sequence[str], step: flo
     periods, starts = np.array([q.probe[0] for q in own]).T
     period = float(np.median(periods))
     alike = np.abs(periods / period - 1) < SAME_PERIOD
-    groups = [tuple(q.place for q, same in zip(own, alike, strict=True) if same)]
+    agree = {q.place for q, same in zip(own, alike, strict=True) if same}
+    groups = [tuple(drive for drive in drives if drive in agree)]
     if alike.all():
         groups.append(tuple(drives))
     later = step * np.arange(math.ceil(period / step))

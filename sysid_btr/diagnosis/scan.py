@@ -251,7 +251,7 @@ def _simulate(
         for i, place in enumerate(places):
             columns[effect, place] = slice(first + i * len(effect.kinds), first + (i + 1) * len(effect.kinds))
         model = model.with_(term, term.neutral)
-    wide, neutral = problem.with_model(model), model.values
+    wide, neutral, nominal = problem.with_model(model), model.values, model.terms.nominal
     # one simulation carries one direction of one perturbation in each subtree
     groups: dict[int, list[tuple[int, int]]] = {}
     for i, perturbation in enumerate(asked):
@@ -265,8 +265,8 @@ def _simulate(
     for row, job in enumerate(jobs, start=1):
         for i, d in job:
             perturbation = asked[i]
-            gone = _replaced(model, perturbation)
-            candidates[row, gone] = model.terms.nominal[gone]
+            for gone in _replaced(model, perturbation):
+                candidates[row, gone] = nominal[gone]
             for place in perturbation.places:
                 candidates[row, columns[perturbation.effect, place]] = perturbation.probe[d]
     subtree_of_row = wide._subtrees[1]
@@ -302,21 +302,19 @@ def _simulate(
     return judged
 
 
-def _replaced(model: Model, perturbation: Perturbation) -> IntArray:
-    """Positions of the numbers of what an effect that a probe gives whole takes the place of.
+def _replaced(model: Model, perturbation: Perturbation) -> list[slice]:
+    """Where the numbers stand of what an effect that a probe gives whole takes the place of.
 
     What it does beside that would be another thing: of commands that come late already, other moments are taken.
     """
     effect, places = perturbation.effect, perturbation.places
     if len(effect.held) < len(effect.kinds):
-        return np.zeros(0, dtype=np.int64)
-    every = np.arange(len(model.values))
-    own = [every[model.terms.columns(t)] for t in model.terms if gives_way(t, effect, places)]
-    return np.concatenate([np.zeros(0, dtype=np.int64), *own])
+        return []
+    return [model.terms.columns(known) for known in model.terms if is_special_case(known, effect, places)]
 
 
-def gives_way(known: Term, effect: type[Effect], places: Sequence[str]) -> bool:
-    """Whether an effect at some places is more general than what is known there, and takes its place."""
+def is_special_case(known: Term, effect: type[Effect], places: Sequence[str]) -> bool:
+    """Whether an effect at some places includes what is known there, and takes its place."""
     if not isinstance(known, Effect):
         return False
     return (known.label or known.name) in effect.includes and set(known.places) <= set(places)

@@ -12,7 +12,7 @@ from sysid_btr.diagnosis.elimination import without_dispensable
 from sysid_btr.diagnosis.evidence import at_the_likeliest_place, evidence_of, is_likely, likeliest, preference, weights
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.leads import Library, leading_hypotheses
-from sysid_btr.diagnosis.scan import gives_way
+from sysid_btr.diagnosis.scan import is_special_case
 from sysid_btr.diagnosis.selection import (
     Selection,
     all_explained,
@@ -249,7 +249,7 @@ def _add(state: State, winner: Trial, trials: Sequence[Trial], rules: Selection)
     hypothesis, fitted = kept.hypothesis, kept.fitted
     evidence = evidence_of(rules, winner, trials)
     # a more general effect takes the place of the special case it includes
-    gone = [e for e in state.effects if gives_way(e, hypothesis.effect, hypothesis.places)]
+    gone = [e for e in state.effects if is_special_case(e, hypothesis.effect, hypothesis.places)]
     staying = [known for e, known in zip(state.effects, state.evidence, strict=True) if e not in gone]
     if gone:
         rest = fitted.model.without(*gone, fitted.model.terms[-1])

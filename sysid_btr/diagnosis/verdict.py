@@ -123,6 +123,6 @@ def giving_way(effect: Effect, candidates: Sequence[Candidate]) -> tuple[str, ..
     """Effects that did as well at the same locations but give way to this one, by convention."""
     there = [c for c in candidates if c.effect == effect.name and set(c.where) == set(effect.places)]
     # of several forms that were tried there, the one that was added last
-    own = next(reversed([*there[:1], *(c for c in there if c.why == ADDED)]), None)
+    own = [c for c in there if c.why == ADDED][-1:] or there[:1]
     giving = {e.name for e in select_effects(("all",)) if effect.name in e.yields_to}
-    return tuple(name for name in (own.confused_with if own else ()) if name in giving)
+    return tuple(name for candidate in own for name in candidate.confused_with if name in giving)
