@@ -23,7 +23,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import write_log
 from sysid_btr.io.split import split_episodes
 from sysid_btr.io.validation import validate_file
-from sysid_btr.memory import VARIABLE, memory_limit, require_memory
+from sysid_btr.machine import VARIABLE, memory_limit, require_memory
 from sysid_btr.reading import parse_json, parse_toml
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_logs"

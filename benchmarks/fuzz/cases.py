@@ -20,7 +20,7 @@ from benchmarks.fuzz.examples import Example
 from benchmarks.fuzz.mutations import broken
 from benchmarks.fuzz.options import strange_command
 from sysid_btr.cli import run
-from sysid_btr.memory import VARIABLE
+from sysid_btr.machine import VARIABLE
 
 ALLOWED = (0, 2, 3, 4, 5)
 """Exit codes: done, usage, log, model, nothing identified."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import socket
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from urllib.parse import urlsplit
 
 from sysid_btr.errors import UsageError
 from sysid_btr.executors.base import HERE, Executor
+from sysid_btr.machine import usable_cores
 from sysid_btr.optional import optional
 
 CONNECT = 10.0
@@ -83,7 +83,7 @@ def _local(place: str) -> int | None:
     if base != "local":
         return None
     if not colon:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return usable_cores()
     if not number.isdecimal() or int(number) < 1:
         raise UsageError(f"--executor {place}: the number of workers must be 1 or more, as in local:4")
     return int(number)

@@ -16,7 +16,7 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.errors import LogError
 from sysid_btr.io.log import META_KEYS, SCHEMA_VERSION, Log, LogMeta, closest, is_schema_column, torques_of_currents
 from sysid_btr.io.problem import Problem
-from sysid_btr.memory import require_memory
+from sysid_btr.machine import require_memory
 from sysid_btr.reading import parse_json
 
 if TYPE_CHECKING:

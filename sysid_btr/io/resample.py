@@ -12,7 +12,7 @@ from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._clock import SNAP, gaps, holding_sample, typical_interval
 from sysid_btr.io.log import COMMANDS, Log
-from sysid_btr.memory import require_memory
+from sysid_btr.machine import require_memory
 
 _SET_CHANNELS = ("enabled", "stiffness")
 """Channels that are set and stay, whatever the commands do."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.interpolation import hermite
-from sysid_btr.memory import require_memory
+from sysid_btr.machine import require_memory
 from sysid_btr.models.commands import FED_FORWARD
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import IntArray
+from sysid_btr.machine import usable_cores
 from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.simulator import States
 from sysid_btr.terms.base import BatchModel, Fields
@@ -52,7 +53,7 @@ def _load(batch: BatchModel, state: Fields, threads: int) -> Batch:
     """A batch with the candidates' numbers in it."""
     from mujoco.batch import Batch
 
-    simulations = Batch(batch.model, batch.size, threads)
+    simulations = Batch(batch.model, batch.size, threads or usable_cores())
     for name, values in _derived(batch, threads).items():
         simulations.expand(name)[...] = values
     for name, values in state.items():
@@ -72,7 +73,7 @@ def _derived(batch: BatchModel, threads: int) -> Fields:
     first: dict[bytes, int] = {}
     same = [first.setdefault(row.tobytes(), i) for i, row in enumerate(numbers)]
     rows, own = np.unique(same, return_inverse=True)
-    few = Batch(batch.model, len(rows), threads)
+    few = Batch(batch.model, len(rows), threads or usable_cores())
     for name in changed:
         few.expand(name)[...] = batch.fields[name][rows]
     few.set_const()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import IntArray
+from sysid_btr.machine import usable_cores
 from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.silence import mujoco_library
 from sysid_btr.simulation.simulator import States
@@ -42,7 +42,7 @@ def roll_out(setup: Setup, fields: Fields, borders: IntArray, threads: int) -> S
     effort = np.empty((0, 0, 0)) if states.effort is None else states.effort
     kept = Kept(np.asarray(borders, dtype=np.int64), qpos, qvel, effort, np.zeros(m, dtype=np.bool_))
     rows = {name: setup.batch.read(name) for name in written(setup)} | fields
-    count = min(threads or len(os.sched_getaffinity(0)), m)
+    count = min(threads or usable_cores(), m)
     stop = np.zeros(1, dtype=np.int64)
     with ThreadPoolExecutor(count) as pool:
         try:

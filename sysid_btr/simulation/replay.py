@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
-from sysid_btr.memory import memory_limit, require_memory
+from sysid_btr.machine import memory_limit, require_memory
 from sysid_btr.models.commands import commanded
 from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot

@@ -25,7 +25,7 @@ from sysid_btr.io.importers.base import MappingNeeded, Recording, Signal
 from sysid_btr.io.importers.mapping import ImportMap
 from sysid_btr.io.log import LogMeta
 from sysid_btr.io.problem import explain
-from sysid_btr.memory import require_memory
+from sysid_btr.machine import require_memory
 from sysid_btr.reading import parse_json
 
 INFO = Path("meta") / "info.json"

@@ -22,7 +22,7 @@ from sysid_btr.io.importers.mapping import TableRule
 from sysid_btr.io.importers.units import Unit, find
 from sysid_btr.io.log import LogMeta
 from sysid_btr.io.problem import explain
-from sysid_btr.memory import require_memory
+from sysid_btr.machine import require_memory
 
 if TYPE_CHECKING:
     import pyarrow as pa

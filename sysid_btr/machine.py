@@ -1,4 +1,4 @@
-"""How much memory a run may take: what would take more is refused before it is asked for."""
+"""What a run may take of the machine: cores, and memory, of which more is refused before it is asked for."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ SHARE = 0.5
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 """Where Linux says what a container may take."""
 GB = 1e9
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on, where the system tells them from those that there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def memory_limit() -> float:
