@@ -140,10 +140,9 @@ def test_a_broken_term_is_caught(cls: type[Term], promise: str) -> None:
         check_term(cls)
 
 
-def test_an_encoder_in_the_loop_of_a_joint_without_a_servo_leaves_the_servos_alone(bench: TermBench) -> None:
-    (term,) = parse_parameters(["encoder_scale.loop:slide"], bench.study.robot)
-    plain, wrong = bench.predict(term, np.zeros(1), np.full(1, 0.2))
-    np.testing.assert_array_equal(wrong[:, :2], plain[:, :2])
+def test_no_encoder_closes_the_loop_of_a_joint_without_a_servo(bench: TermBench) -> None:
+    with pytest.raises(UsageError, match=r"'slide' matches no joint with a servo .* there are: hip, knee"):
+        parse_parameters(["encoder_scale.loop:slide"], bench.study.robot)
 
 
 def test_the_stiffest_gear_gets_stiffer_with_a_finer_step() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.interpolation import hermite
-from sysid_btr.terms.base import BatchModel, Fields, Kind, Outputs
+from sysid_btr.terms.base import BatchModel, Fields, Kind, Outputs, Scope
 from sysid_btr.terms.effect import Effect, Probe
 from sysid_btr.terms.scales import JointScale
 from sysid_btr.terms.waves import nearby_waves
@@ -50,12 +50,11 @@ class EncoderOffsetInLoop(EncoderOffset):
     """
 
     variant: ClassVar[str] = "loop"
+    scope: ClassVar[Scope] = "servo"
 
     def shape_command(self, batch: BatchModel, values: FloatArray, command: FloatArray, time: FloatArray) -> FloatArray:
-        shaped, columns = command.copy(), batch.index.of(self.places)
-        # nothing but a command of position is compared with what the encoder shows
-        fed = batch.index.driven_by("position")[columns]
-        shaped[:, :, columns[fed]] -= values[:, None, fed, 0]
+        shaped = command.copy()
+        shaped[:, :, batch.index.of(self.places)] -= values[:, None, :, 0]
         return shaped
 
 
@@ -91,11 +90,11 @@ class EncoderScaleInLoop(EncoderScale):
     """
 
     variant: ClassVar[str] = "loop"
+    scope: ClassVar[Scope] = "feedback"
 
     def model_fields(self, batch: BatchModel, values: FloatArray) -> Fields:
-        ids = batch.index.actuator[batch.index.of(self.places)]
-        bias, driven = batch.read("actuator_biasprm"), ids >= 0
-        bias[:, ids[driven], 1:3] *= 1 + values[:, driven, :1]
+        bias = batch.read("actuator_biasprm")
+        bias[:, batch.index.actuator[batch.index.of(self.places)], 1:3] *= 1 + values[:, :, :1]
         return {"actuator_biasprm": bias}
 
 
