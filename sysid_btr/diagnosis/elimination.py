@@ -44,11 +44,10 @@ def eliminate(state: State, library: Library, rules: Selection, progress: Progre
     state = _pruned(state.in_longest_steps(), rules)
     if not state.effects:
         return state.in_first_steps()
-    joined = as_curves(state, library, rules)
-    # what took up the errors of their form goes with them
-    state = state if joined is state else _pruned(joined, rules)
+    state = _pruned_where_changed(state, as_curves(state, library, rules), rules)
     progress(done=state.replays, total=None, best=nan, note="each effect against what else it may be")
-    state = _merged(exchange(state, library, rules), rules).in_first_steps()
+    state = _pruned_where_changed(state, exchange(state, library, rules), rules)
+    state = _merged(state, rules).in_first_steps()
     state = _states_in_turn(state)
     study = inflate(state.study, state.fitted, memory=True)
     progress(done=state.replays, total=None, best=nan, note="final fit")
@@ -155,6 +154,11 @@ def _pruned(state: State, rules: Selection) -> State:
         if dropped:
             removed.append(f"{effect.name} at {', '.join(dropped)}")
     return state.step(removed=removed) if removed else state
+
+
+def _pruned_where_changed(before: State, state: State, rules: Selection) -> State:
+    """The state pruned again if its effects are others than before: what took up the errors of those goes with them."""
+    return state if state.effects == before.effects else _pruned(state, rules)
 
 
 def _at_fewer_locations(state: State, effect: Effect, rules: Selection) -> tuple[State, tuple[str, ...]]:

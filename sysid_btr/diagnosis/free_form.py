@@ -47,7 +47,7 @@ LOUD = 1.3
 WEAK = 0.2
 """Share of the missing torque that a curve must predict, likewise."""
 NEARLY = 0.07
-"""A form that comes earlier is preferred if its share is within this of the best one's, likewise."""
+"""A form that comes earlier stands before the best one if its share is within this of that one's, likewise."""
 STRETCH, SHORT_STRETCH = 2.5, 0.5
 """Seconds that are predicted from the others, for a function of a state, and of time, likewise."""
 CYCLES = 3.0
@@ -112,7 +112,8 @@ class FreeForm:
 def free_forms(
     problem: ReplayProblem, values: FloatArray, scales: Scales, missing: Sequence[MissingTorque]
 ) -> tuple[FreeForm, ...]:
-    """Curves that predict what is missing: first the best one of each joint, then the others, by what they explain.
+    """Curves that predict what is missing, by what they explain: first those of each joint that replays are to decide
+    between, the plainest that is nearly the best and the best one, then the others.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ def free_forms(
     loud = [m for m in missing if m.chi2 >= LOUD]
     known = {(type(term), place) for term in problem.terms for place in term.places}
     drives = {j: d for e in problem.episodes for j, d in zip(e.replay.index.joints, e.replay.index.drive, strict=True)}
-    best: list[FreeForm] = []
+    first: list[list[FreeForm]] = []
     others: list[FreeForm] = []
     for joint in dict.fromkeys(m.joint for m in loud):
         own = [m for m in loud if m.joint == joint]
@@ -137,11 +138,12 @@ def free_forms(
             if form.share >= WEAK
         ]
         if found:
-            most = max(f.share for f in found)
-            chosen = next(f for f in found if f.share >= most - NEARLY)
-            best.append(chosen)
-            others += [f for f in found if f is not chosen]
-    return tuple(f for part in (best, others) for f in sorted(part, key=lambda f: -f.hypothesis.gain))
+            best = max(found, key=lambda f: f.share)
+            plainest = next(f for f in found if f.share >= best.share - NEARLY)
+            first.append([plainest] if plainest is best else [plainest, best])
+            others += [f for f in found if f not in first[-1]]
+    first.sort(key=lambda own: -own[0].hypothesis.gain)
+    return (*(f for own in first for f in own), *sorted(others, key=lambda f: -f.hypothesis.gain))
 
 
 def _can_be_at(effect: type[FreeCurve], drive: DriveKind | None) -> bool:
