@@ -826,7 +826,7 @@ SURE, DOUBTFUL, EITHER, NEITHER = a_name(0.9), a_name(0.4), a_name(0.9, "backlas
         (fitted([60.0]), (DOUBTFUL, SURE), False, "partly_explained"),
         (fitted([3.5]), (SURE, EITHER), False, "ambiguous"),
         (fitted([3.7]), (EITHER,), False, "partly_explained"),
-        (fitted([3.5]), (SURE, NEITHER), False, "explained"),
+        (fitted([3.5]), (SURE, NEITHER), False, "partly_explained"),
         (fitted([3.5]), (NEITHER,), False, "unexplained"),
         (fitted([150.0]), (SURE,), False, "unexplained"),
     ],

@@ -27,14 +27,17 @@ NAMED: tuple[Verdict, ...] = ("explained", "partly_explained", "ambiguous")
 def verdict_of(
     rules: Selection, before: Fitted, now: Fitted, named: Sequence[NamedEffect], *, floating: bool
 ) -> Verdict:
-    """The verdict on effects that lead from one model to another."""
+    """The verdict on effects that lead from one model to another.
+
+    What an effect took up that is less likely than not what it is called is not explained.
+    """
     limit = verdict_limit(rules, before.overall_chance)
     if not named:
         return "nothing_missing" if max(now.holdout, now.train) <= limit else "unexplained"
     likely = [e for e in named if e.likely]
     if not likely:
         return "unexplained"
-    if is_log_explained(rules, before, now, floating=floating):
+    if len(likely) == len(named) and is_log_explained(rules, before, now, floating=floating):
         return "ambiguous" if any(e.confused_with for e in likely) else "explained"
     # what predicts data that were not fitted worse than the model without it is no explanation
     return "partly_explained" if now.holdout < before.holdout else "unexplained"

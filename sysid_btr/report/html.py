@@ -34,7 +34,7 @@ LARGEST, LARGEST_RAW = 4_000_000, 500_000
 """Characters of a page's pictures, and of result.json in it; the whole stays below 5 MB."""
 VERDICTS = {
     "explained": "The log shows effects that the model lacks, and they are named below.",
-    "partly_explained": "The log shows effects that the model lacks, named below, and something more.",
+    "partly_explained": "The log shows effects that the model lacks, named below, and something without a likely name.",
     "nothing_missing": "With these parameters the model explains the log down to the noise of its sensors.",
     "ambiguous": "Something is missing, and on this log several effects that would explain it are confounded.",
     "unexplained": "Something is missing, and no name for it is more likely than not.",
