@@ -543,6 +543,27 @@ def test_one_place_of_an_effect_that_stands_for_something_else_is_exchanged() ->
     assert exchange(state, (ViscousDamping, CoulombFriction, JointSpring), STANDARD).effects == state.effects
 
 
+def test_one_of_two_that_no_model_holds_at_once_takes_the_place_of_the_other() -> None:
+    """A gear that gives way, beside friction that was found with it, where there is play: no scan asks for both."""
+    log, rng = motion(), np.random.default_rng(0)
+    shown = toys.run(toys.leg(), log, (CoulombFriction(("hip",)), Backlash(KNEE)), [0.15, 0.02, 0.0], OTHERWISE)
+    noisy = {
+        f"position.{j}": shown.position[0, :, i] + rng.normal(0, 4e-4, len(log)) for i, j in enumerate(toys.LEG_JOINTS)
+    }
+    study = make_study(toys.leg(), [replace(log, channels={**log.channels, **noisy})], threads=1)
+    state = State.of(fit(study, ["kp:*=shared"]), None)
+    for wrong in (Hypothesis(CoulombFriction, ("hip",), False, np.array([0.15]), 0.0), soft_gear(0.02)):
+        found = attempt(study, state.fitted.model, wrong, STANDARD)
+        state = replace(state, fitted=found.fitted, evidence=(*state.evidence, Evidence()))
+    state = exchange(state, (CoulombFriction, JointCompliance, Backlash), STANDARD)
+    assert [(e.name, e.places) for e in state.effects] == [("coulomb_friction", ("hip",)), ("backlash", KNEE)]
+    np.testing.assert_allclose(state.fitted.model.values[1:3], [0.15, 0.02], rtol=0.05)
+
+
+def soft_gear(softness: float) -> Hypothesis:
+    return Hypothesis(JointCompliance, KNEE, False, np.array([softness]), 0.0)
+
+
 # --- where and when it shows -------------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from sysid_btr._typing import IntArray
 from sysid_btr.diagnosis.evidence import evidence_of, is_likely, is_missed, likeliest
 from sysid_btr.diagnosis.hypotheses import Hypothesis
-from sysid_btr.diagnosis.leads import Library, replacements
+from sysid_btr.diagnosis.leads import Library, hypotheses_at, replacements
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt, near_best
@@ -77,7 +77,8 @@ def exchange(state: State, library: Library, rules: Selection) -> State:
     leads = replacements(state, library, columns, rules) if rescanned else [[] for _ in parts]
     for part, others in zip(parts, leads, strict=True):
         if part.effect in state.effects:
-            state = _compared(state, part, others, rules)
+            split = _split_otherwise(state, part, library, rules) if rescanned else []
+            state = _compared(state, part, others, split, rules)
     return state
 
 
@@ -88,7 +89,18 @@ def _parts(state: State, rules: Selection) -> list[_Part]:
     return whole + [_Part(effect, (place,)) for effect in several for place in effect.places]
 
 
-def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Selection) -> State:
+def _split_otherwise(state: State, part: _Part, library: Library, rules: Selection) -> list[Hypothesis]:
+    """What else may split the model where a part does: as two cannot, none was asked for beside it."""
+    effect = part.effect
+    kinds = [e for e in library if e.structural and e.scope == effect.scope and e is not type(effect)]
+    if not effect.structural or not kinds:
+        return []
+    return hypotheses_at(state.study, part.without(state.fitted.model, state), kinds, part.places, rules)
+
+
+def _compared(
+    state: State, part: _Part, others: Sequence[Hypothesis], split: Sequence[Hypothesis], rules: Selection
+) -> State:
     """The state with a part as it is, or with what predicts better, or as well and is simpler, in its place."""
     model, at = state.fitted.model, state.effects.index(part.effect)
     others = [h for h in others if not _says_the_same(h, part, model)]
@@ -100,6 +112,7 @@ def _compared(state: State, part: _Part, others: Sequence[Hypothesis], rules: Se
         known = [h for h in known if part.effect.transient or not h.effect.transient]
         hypotheses += [h for h in known if not _among(h, hypotheses)]
         hypotheses += [h for h in _at_fewer(part, model) if not _among(h, hypotheses)]
+    hypotheses += [h for h in split if not _among(h, hypotheses)]
     rest = part.without(model, state)
     hypotheses = [h for h in hypotheses if rest.terms.admit(h.effect, h.places)]
     if not hypotheses:

@@ -88,6 +88,17 @@ def replacements(state: State, library: Library, parts: Sequence[IntArray], rule
     return result
 
 
+def hypotheses_at(
+    study: Study, model: Model, effects: Library, places: Sequence[str], rules: Selection
+) -> list[Hypothesis]:
+    """What effects of one scope would explain, to first order, at some of its places beside a model, best first."""
+    problem, residual, jacobian = _linear(study, model, rules)
+    asked = perturbations(effects, {effects[0].scope: tuple(places)}, study.scales)
+    cheap = problem.with_numerics(study.cheap)
+    found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
+    return form_hypotheses(found, len(residual), study.scales, rules)
+
+
 def _linear(study: Study, model: Model, rules: Selection) -> tuple[ReplayProblem, FloatArray, FloatArray]:
     """What is scanned: the problem, and its residual (r,) and Jacobian (r, p) under the model so far."""
     if study.procedure.wanders:
