@@ -121,10 +121,11 @@ def _compared(
     for hypothesis in hypotheses:
         trials.append(attempt(state.study, rest, hypothesis, rules, [t.fitted for t in trials]))
     state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
+    believed = trials
+    if state.study.procedure.wanders:
+        believed = [t for t in trials if t is trials[0] or is_believed(rules, t, trials)]
     # where the model states what decides, data show next to nothing of it
-    winner = likeliest(trials) if state.study.held else preferred(rules, trials)
-    if winner is not trials[0] and state.study.procedure.wanders and not is_believed(rules, winner, trials):
-        winner = trials[0]
+    winner = likeliest(believed) if state.study.held else preferred(rules, believed)
     evidence = evidence_of(rules, winner, trials)
     if winner is trials[0]:
         if not part.whole:
@@ -176,14 +177,18 @@ def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:
     return any(h.effect is hypothesis.effect and set(h.places) == set(hypothesis.places) for h in others)
 
 
-def is_believed(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> bool:
-    """Whether a winner takes the place of the first trial also where what is left grows in a replay.
+def is_believed(rules: Selection, trial: Trial, trials: Sequence[Trial]) -> bool:
+    """Whether a trial may take the place of the first one also where what is left grows in a replay.
 
-    Much would take that up, see `search`: it must be likely, or predict no worse with fewer numbers.
+    Much would take that up, see `search`: it must be likely, or have no more numbers and predict all data, and those
+    held out, no worse.
     """
     own = trials[0]
-    simpler = winner.hypothesis.complexity < own.hypothesis.complexity
-    return (simpler and winner.fitted.misfit <= own.fitted.misfit) or is_likely(rules, own.fitted, winner, trials)
+    wider = trial.hypothesis.complexity > own.hypothesis.complexity
+    now, then = own.fitted, trial.fitted
+    if not wider and then.misfit <= now.misfit and then.misfit_everywhere <= now.misfit_everywhere:
+        return True
+    return is_likely(rules, now, trial, trials)
 
 
 def preferred(rules: Selection, trials: Sequence[Trial]) -> Trial:
