@@ -180,15 +180,11 @@ def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:
 def is_believed(rules: Selection, trial: Trial, trials: Sequence[Trial]) -> bool:
     """Whether a trial may take the place of the first one also where what is left grows in a replay.
 
-    Much would take that up, see `search`: it must be likely, or have no more numbers and predict all data, and those
-    held out, no worse.
+    Much would take that up, see `search`: it must be likely, or predict no worse with fewer numbers.
     """
     own = trials[0]
-    wider = trial.hypothesis.complexity > own.hypothesis.complexity
-    now, then = own.fitted, trial.fitted
-    if not wider and then.misfit <= now.misfit and then.misfit_everywhere <= now.misfit_everywhere:
-        return True
-    return is_likely(rules, now, trial, trials)
+    simpler = trial.hypothesis.complexity < own.hypothesis.complexity
+    return (simpler and trial.fitted.misfit <= own.fitted.misfit) or is_likely(rules, own.fitted, trial, trials)
 
 
 def preferred(rules: Selection, trials: Sequence[Trial]) -> Trial:
