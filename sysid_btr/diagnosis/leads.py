@@ -30,6 +30,8 @@ from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
 
 Library = Sequence[type[Effect]]
+Linear = tuple[ReplayProblem, FloatArray, FloatArray]
+"""A problem, and its residual (r,) and Jacobian (r, p) under a model."""
 
 
 def leading_hypotheses(state: State, library: Library, rules: Selection) -> tuple[list[Hypothesis], int]:
@@ -92,14 +94,12 @@ def hypotheses_at(
     study: Study, model: Model, effects: Library, places: Sequence[str], rules: Selection
 ) -> list[Hypothesis]:
     """What effects of one scope would explain, to first order, at some of its places beside a model, best first."""
-    problem, residual, jacobian = _linear(study, model, rules)
+    linear = _linear(study, model, rules)
     asked = perturbations(effects, {effects[0].scope: tuple(places)}, study.scales)
-    cheap = problem.with_numerics(study.cheap)
-    found = scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
-    return form_hypotheses(found, len(residual), study.scales, rules)
+    return form_hypotheses(_scanned(study, model, linear, asked, rules), len(linear[1]), study.scales, rules)
 
 
-def _linear(study: Study, model: Model, rules: Selection) -> tuple[ReplayProblem, FloatArray, FloatArray]:
+def _linear(study: Study, model: Model, rules: Selection) -> Linear:
     """What is scanned: the problem, and its residual (r,) and Jacobian (r, p) under the model so far."""
     if study.procedure.wanders:
         study = _weighed(study, model)
@@ -109,23 +109,27 @@ def _linear(study: Study, model: Model, rules: Selection) -> tuple[ReplayProblem
 
 def _scan(state: State, library: Library, rules: Selection) -> tuple[list[Sensitivity], int]:
     """What every effect would do to the residual, best first, and the number of residuals."""
-    study, model = state.study, _scanned(state)
-    problem, residual, jacobian = _linear(study, model, rules)
+    study, model = state.study, _simulated(state)
+    linear = problem, residual, _ = _linear(study, model, rules)
     asked = _perturbations(state, library, problem, residual)
-
-    def scanned(problem: ReplayProblem, residual: FloatArray, jacobian: FloatArray) -> list[Sensitivity]:
-        # what is left is the right integrator's; what an effect would change may be a little off
-        cheap = problem.with_numerics(study.cheap)
-        return scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
-
     if study.procedure.costly and len(asked) > rules.glance_most:
-        glance = shorten(study, rules.glance_seconds).train_problem(model)
-        linear = linearise(study.with_belief(glance), model.values, step=study.stencil(model.terms))
-        asked = [s.perturbation for s in scanned(glance, *linear)[: rules.glance_most]]
-    return scanned(problem, residual, jacobian), len(residual)
+        short = shorten(study, rules.glance_seconds).train_problem(model)
+        glance = short, *linearise(study.with_belief(short), model.values, step=study.stencil(model.terms))
+        asked = [s.perturbation for s in _scanned(study, model, glance, asked, rules)[: rules.glance_most]]
+    return _scanned(study, model, linear, asked, rules), len(residual)
 
 
-def _scanned(state: State) -> Model:
+def _scanned(
+    study: Study, model: Model, linear: Linear, asked: Sequence[Perturbation], rules: Selection
+) -> list[Sensitivity]:
+    """What perturbations of a model would explain of its residual, best first."""
+    problem, residual, jacobian = linear
+    # what is left is the right integrator's; what an effect would change may be a little off
+    cheap = problem.with_numerics(study.cheap)
+    return scan(cheap, model.values, residual, jacobian, asked, study.scales, rules)
+
+
+def _simulated(state: State) -> Model:
     """The model in which effects are simulated: as fitted, or, while all is missing, before it was fitted far off.
 
     What declared parameters can do is taken off to first order, wherever they are.

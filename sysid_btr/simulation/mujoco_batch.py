@@ -28,6 +28,7 @@ class MujocoBatch:
     """Simulations of a `mujoco.batch.Batch`, on as many threads as are asked for."""
 
     def rollout(self, setup: Setup, borders: IntArray, *, threads: int = 0) -> States:
+        threads = threads or usable_cores()
         if setup.laws or setup.held_steps:
             # imports what compiles laws, which takes a second
             from sysid_btr.simulation.mujoco_steps import roll_out
@@ -43,7 +44,7 @@ def evaluate(
     batch: BatchModel, state: Fields, names: Sequence[str], *, stage: int = ACCELERATION, threads: int = 0
 ) -> Fields:
     """What MuJoCo derives from given states: fields of MjData by name, (m, ...) each, computed up to a stage."""
-    simulations = _load(batch, state, threads)
+    simulations = _load(batch, state, threads or usable_cores())
     found = {name: simulations.bind(name) for name in names}
     simulations.forward(stage=stage)
     return {name: values.copy() for name, values in found.items()}
@@ -53,7 +54,7 @@ def _load(batch: BatchModel, state: Fields, threads: int) -> Batch:
     """A batch with the candidates' numbers in it."""
     from mujoco.batch import Batch
 
-    simulations = Batch(batch.model, batch.size, threads or usable_cores())
+    simulations = Batch(batch.model, batch.size, threads)
     for name, values in _derived(batch, threads).items():
         simulations.expand(name)[...] = values
     for name, values in state.items():
@@ -73,7 +74,7 @@ def _derived(batch: BatchModel, threads: int) -> Fields:
     first: dict[bytes, int] = {}
     same = [first.setdefault(row.tobytes(), i) for i, row in enumerate(numbers)]
     rows, own = np.unique(same, return_inverse=True)
-    few = Batch(batch.model, len(rows), threads or usable_cores())
+    few = Batch(batch.model, len(rows), threads)
     for name in changed:
         few.expand(name)[...] = batch.fields[name][rows]
     few.set_const()

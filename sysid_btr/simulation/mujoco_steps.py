@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid_btr._typing import IntArray
-from sysid_btr.machine import usable_cores
 from sysid_btr.simulation.setup import Setup
 from sysid_btr.simulation.silence import mujoco_library
 from sysid_btr.simulation.simulator import States
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def roll_out(setup: Setup, fields: Fields, borders: IntArray, threads: int) -> States:
-    """Roll out on a number of threads, 0 for all cores; `fields` are those in which candidates differ."""
+    """Roll out on a number of threads; `fields` are those in which candidates differ."""
     plan, own = plan_of(setup)
     m, k, model = setup.size, len(borders), setup.model
     states = States.empty(m, k, setup.index, effort=gives_effort(setup))
@@ -42,7 +41,7 @@ def roll_out(setup: Setup, fields: Fields, borders: IntArray, threads: int) -> S
     effort = np.empty((0, 0, 0)) if states.effort is None else states.effort
     kept = Kept(np.asarray(borders, dtype=np.int64), qpos, qvel, effort, np.zeros(m, dtype=np.bool_))
     rows = {name: setup.batch.read(name) for name in written(setup)} | fields
-    count = min(threads or usable_cores(), m)
+    count = min(threads, m)
     stop = np.zeros(1, dtype=np.int64)
     with ThreadPoolExecutor(count) as pool:
         try:
