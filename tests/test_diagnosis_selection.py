@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid_btr._typing import FloatArray
 from sysid_btr.diagnosis.closing import Candidate, NamedEffect, Verdict
 from sysid_btr.diagnosis.evidence import evidence_of, is_likely
 from sysid_btr.diagnosis.hypotheses import Hypothesis, form_hypotheses
@@ -28,17 +27,16 @@ from sysid_btr.diagnosis.selection import (
     doubtful_location,
     explains_fitted,
     has_minimum_gain,
-    hidden_columns,
     improves,
     improves_once,
     is_explained,
     is_log_explained,
     is_needed,
     relieves,
+    shows_late,
     something_left,
     verdict_limit,
 )
-from sysid_btr.diagnosis.split import cut_time
 from sysid_btr.diagnosis.trials import (
     ADDED,
     Trial,
@@ -871,44 +869,23 @@ def test_what_did_as_well_as_another_form_is_not_confused_with_the_one_that_was_
         assert giving_way(CommandDelay(("hip",)), tried) == ()
 
 
-# --- where an effect shows only in what was to be held out ------------------------------------------------------------
+# --- what is held out -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("train", "holdout", "expected"),
+    ("train", "holdout", "late"),
     [
-        ([1.11, 1.0], [5.0, 1.0], [True, False]),
-        ([1.13, 1.0], [5.0, 1.0], None),
-        ([1.0, 1.0], [1.11, 1.0], None),
-        ([1.0, 1.0], [1.13, 1.0], [True, False]),
+        ([1.11, 1.0], [5.0, 1.0], True),
+        ([1.13, 1.0], [5.0, 1.0], False),
+        ([1.0, 1.0], [1.11, 1.0], False),
+        ([1.0, 1.0], [1.13, 1.0], True),
         # most of the excess is in columns that are explained where fitted
-        ([1.0, 9.0], [5.1, 5.0], [True, False]),
-        ([1.0, 9.0], [4.9, 5.0], None),
+        ([1.0, 9.0], [5.1, 5.0], True),
+        ([1.0, 9.0], [4.9, 5.0], False),
     ],
 )
-def test_hidden_columns(train: Numbers, holdout: Numbers, expected: Sequence[bool] | None) -> None:
-    found = hidden_columns(RULES, fitted(holdout, train))
-    assert (None if found is None else found.tolist()) == expected
-
-
-def excess(*where: int) -> FloatArray:
-    return np.array([1.0 if k in where else 0.0 for k in range(20)])
-
-
-@pytest.mark.parametrize(
-    ("by_stretch", "now", "expected"),
-    [
-        # half of what goes on, and all of what is brief, in half seconds of a log of 10 s
-        (excess(*range(12, 20)), 6.0, 8.0),
-        (excess(14, 15, 16), 6.0, 8.5),
-        (excess(13, 14, 15, 16), 6.0, 7.5),
-        (excess(19), 6.0, 9.0),
-        (excess(), 6.0, 6.0),
-        (excess(19), 9.5, 9.5),
-    ],
-)
-def test_the_time_to_which_the_fitted_part_is_extended(by_stretch: FloatArray, now: float, expected: float) -> None:
-    assert cut_time(by_stretch, now, 10.0, RULES) == expected
+def test_what_shows_only_at_the_end(train: Numbers, holdout: Numbers, late: bool) -> None:
+    assert shows_late(RULES, fitted(holdout, train)) == late
 
 
 RULES_OF_ONE_COLUMN: list[Callable[..., Any]] = [improves, improves_once, explains_fitted, relieves, is_needed]

@@ -166,6 +166,20 @@ def test_only_the_latest_attachment_is_kept(tmp_path: Path) -> None:
         again.attachment(0)
 
 
+def test_each_search_keeps_its_latest_attachment(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    first = Journal(path)
+    for size in (1.0, 2.0):
+        first.append(_record(size), np.full((2, 2), size))
+    second = first.section()
+    for size in (3.0, 4.0):
+        second.append(_record(size), np.full((2, 2), size))
+    again = Journal(path)
+    for number, size in ((1, 2.0), (3, 4.0)):
+        np.testing.assert_array_equal(again.attachment(number), np.full((2, 2), size))
+    assert len(list(tmp_path.glob("*.npy"))) == 2
+
+
 def test_attachments_of_other_journals_are_left_alone(tmp_path: Path) -> None:
     other = tmp_path / "fit.journal.extra"
     Journal(other).append(_record(1.0), np.ones((1, 1)))

@@ -37,6 +37,7 @@ from sysid_btr.executors.wire import pack, unpack
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.study import Study, make_study
 from sysid_btr.io.log import Log
+from sysid_btr.io.split import held_out_all_over
 from sysid_btr.objectives.distance import DistanceProblem, MeanSquare, Phi1, Phi2, Wasserstein
 from sysid_btr.objectives.marginal import Projection
 from sysid_btr.objectives.problem import ReplayProblem, of_both
@@ -154,8 +155,13 @@ def test_a_problem_in_parts_gives_side_by_side_what_the_whole_gives(effect: str)
 
 
 @pytest.mark.parametrize("logs", [1, 2])
-def test_one_replay_gives_what_is_fitted_and_what_is_held_out(logs: int) -> None:
+@pytest.mark.parametrize("at_the_end", [True, False])
+def test_one_replay_gives_what_is_fitted_and_what_is_held_out(logs: int, at_the_end: bool) -> None:
     own = study(logs=logs)
+    if not at_the_end:
+        held = [held_out_all_over(e.recording.time, 0.3, 7) for e in own.train]
+        train = tuple(e.scoring(~h) for e, h in zip(own.train, held, strict=True))
+        own = replace(own, train=train, holdout=tuple(e.scoring(h) for e, h in zip(own.train, held, strict=True)))
     terms = own.declare(FREE)
     fitted, heldout = own.train_problem(terms), own.holdout_problem(terms)
     values = candidates(fitted, 1)

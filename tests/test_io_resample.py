@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io import Log, LogMeta, command_at, holdout_split, read_log, resample
+from sysid_btr.io.split import held_out_all_over, spans_of
 
 
 def small_log(time: np.ndarray, command: np.ndarray, position: np.ndarray, hold: str = "zoh", **more: object) -> Log:
@@ -203,6 +204,24 @@ def test_split_is_by_time_and_loses_nothing(n: int, holdout: float) -> None:
     cut = time[-1] - holdout * (time[-1] - time[0])
     assert train.time[-1] < cut + 1e-9
     assert test.time[0] >= cut - 1e-9
+
+
+@given(n=st.integers(50, 600), share=st.floats(0.1, 0.5), parts=st.integers(2, 30))
+@settings(max_examples=60, deadline=None)
+def test_parts_that_are_held_out_lie_all_over(n: int, share: float, parts: int) -> None:
+    time = 1000 + np.cumsum(np.linspace(0.01, 0.03, n))
+    held = held_out_all_over(time, share, parts)
+    spans, since = spans_of(time, held), time - time[0]
+    inside = [(since >= begin) & (since <= end) for begin, end in spans]
+    np.testing.assert_array_equal(held, np.any(inside, axis=0) if inside else np.zeros(n, dtype=bool))
+    every, part = max(round(1 / share), 2), since[-1] / parts
+    assert len(spans) == (parts - 1) // every
+    for i, (begin, end) in enumerate(spans):
+        assert begin == pytest.approx((i * every + every - 1) * part, abs=0.03)
+        assert end - begin == pytest.approx(part, abs=0.06)
+    if spans:
+        assert not held[0]
+        assert not held[-1]
 
 
 def test_split_of_episodes_counts_only_time_within() -> None:

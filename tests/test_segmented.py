@@ -25,6 +25,7 @@ from sysid_btr.identify.scores import score
 from sysid_btr.identify.segmented import SegmentedEpisode, follow, measured_motion
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.log import Log, LogMeta
+from sysid_btr.io.split import held_out_all_over
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
@@ -371,6 +372,18 @@ def test_segments_tile_what_is_fitted_and_what_is_held_out() -> None:
     assert np.array_equal(rows[1:, 0], rows[:-1, 1])
     assert np.array_equal(fitted_part.compared, fitted_part.scored[: len(fitted_part.log)])
     assert not (fitted_part.scored & held.scored).any()
+
+
+def test_segments_go_on_through_what_is_held_out_between() -> None:
+    log = driven()
+    fitted_part, held = SegmentedEpisode.split(double_pendulum(), log, 0.3, seconds=0.4)
+    scored = held_out_all_over(log.time, 0.3, 8)
+    for part, own in ((fitted_part.scoring(~scored), ~scored), (held.scoring(scored), scored)):
+        rows, counted = part.segments.rows, np.flatnonzero(own)
+        assert (rows[0, 0], rows[-1, 1]) == (counted[0], counted[-1] + 1)
+        assert np.array_equal(rows[1:, 0], rows[:-1, 1])
+        assert np.array_equal(part.compared, own[: len(part.log)])
+        assert np.diff(rows) == pytest.approx(0.4 / np.median(np.diff(log.time)), rel=0.2)
 
 
 def test_a_joint_that_is_not_logged_starts_where_the_model_has_it() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ from sysid_btr.diagnosis.closing import Closing
 from sysid_btr.diagnosis.elimination import eliminate
 from sysid_btr.diagnosis.search import search
 from sysid_btr.diagnosis.selection import STANDARD, Selection
-from sysid_btr.diagnosis.split import later_split
+from sysid_btr.diagnosis.split import held_out_elsewhere
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.uncertainty import with_discrepancy
 from sysid_btr.diagnosis.verdict import conclude, named_effects, verdict_of
@@ -83,28 +82,27 @@ def close(
     if "all" in effects:
         asked = (*asked, *FREE_FORMS)
     require_motion(study)
-    while True:
+    elsewhere: Study | None = study
+    while elsewhere is not None:
+        study = elsewhere
         with phase("fit", 0.2):
             first = fit(study, parameters, rng=rng, journal=journal, progress=progress, start=start)
         state = State.of(first, journal)
         library = usable_effects(asked, study)
-        with phase("search", 0.7):
-            state = search(state, library, selection, progress)
-        with phase("elimination", 0.8):
-            state = with_discrepancy(eliminate(state, library, selection, progress))
-        floating = state.study.procedure.leaves_ground_error
-        named, spent = named_effects(state, selection)
-        state = state.spent(spent)
-        verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)
-        short = verdict in ("unexplained", "partly_explained")
-        later = later_split(state.study, state.fitted, selection) if short else None
-        if later is None:
-            return conclude(state, verdict, named, selection, perf_counter() - began)
-        # what is missing shows only after the fitted part: fit more of the log, hold out what is left
-        study = replace(
-            later, numerics=first.study.numerics, inflation={}, independent=False, redundancy=0.0, held=False
-        )
-        journal = later.journal and later.journal.section()
+        elsewhere = held_out_elsewhere(state, selection)
+        if elsewhere is None:
+            with phase("search", 0.7):
+                state = search(state, library, selection, progress)
+            with phase("elimination", 0.8):
+                state = with_discrepancy(eliminate(state, library, selection, progress))
+            floating = state.study.procedure.leaves_ground_error
+            named, spent = named_effects(state, selection)
+            state = state.spent(spent)
+            verdict = verdict_of(selection, state.before, state.fitted, named, floating=floating)
+            short = verdict in ("unexplained", "partly_explained")
+            elsewhere = held_out_elsewhere(state, selection) if short else None
+        journal = journal and journal.section()
+    return conclude(state, verdict, named, selection, perf_counter() - began)
 
 
 def require_motion(study: Study) -> None:

@@ -21,6 +21,7 @@ from sysid_btr.objectives.problem import ReplayProblem
 from sysid_btr.simulation.segments import SegmentReplay
 from sysid_btr.simulation.silence import silenced
 from sysid_btr.terms.drives import DriveKind
+from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import (
     FREE_FORMS,
     FreeCurve,
@@ -46,6 +47,8 @@ LOUD = 1.3
 """Chi2 of a joint's position from which its torque is looked at, as for the signature."""
 WEAK = 0.2
 """Share of the missing torque that a curve must predict, likewise."""
+MOSTLY = 0.5
+"""Share from which what is missing is a function of time."""
 NEARLY = 0.07
 """A form that comes earlier stands before the best one if its share is within this of that one's, likewise."""
 STRETCH, SHORT_STRETCH = 2.5, 0.5
@@ -121,11 +124,38 @@ def free_forms(
     scales : sizes at the joints.
     missing : the torques that they lack, as `missing_torques` estimates them.
     """
+    first: list[list[FreeForm]] = []
+    others: list[FreeForm] = []
+    for found in _by_joint(problem, values, scales, missing):
+        first.append(_leading(found))
+        others += [f for f in found if f not in first[-1]]
+    first.sort(key=lambda own: -own[0].hypothesis.gain)
+    return (*(f for own in first for f in own), *sorted(others, key=lambda f: -f.hypothesis.gain))
+
+
+def follows_time(problem: ReplayProblem, values: FloatArray, scales: Scales, missing: Sequence[MissingTorque]) -> bool:
+    """Whether what is missing at a joint is mostly a function of time, and none of anything else predicts it better.
+
+    Parameters
+    ----------
+    problem, values, scales, missing : as for `free_forms`.
+    """
+    found = (f for own in _by_joint(problem, values, scales, missing) for f in _leading(own))
+    return any(of_time_alone(f.hypothesis.effect) and f.share >= MOSTLY for f in found)
+
+
+def of_time_alone(effect: type[Effect]) -> bool:
+    """Whether a form is a function of time that does not come back, and so is told only between data."""
+    return issubclass(effect, OF_TIME) and not effect.periodic
+
+
+def _by_joint(
+    problem: ReplayProblem, values: FloatArray, scales: Scales, missing: Sequence[MissingTorque]
+) -> Iterator[list[FreeForm]]:
+    """Curves that predict what is missing at each joint where they do, the plainest first."""
     loud = [m for m in missing if m.chi2 >= LOUD]
     known = {(type(term), place) for term in problem.terms for place in term.places}
     drives = {j: d for e in problem.episodes for j, d in zip(e.replay.index.joints, e.replay.index.drive, strict=True)}
-    first: list[list[FreeForm]] = []
-    others: list[FreeForm] = []
     for joint in dict.fromkeys(m.joint for m in loud):
         own = [m for m in loud if m.joint == joint]
         found = [
@@ -138,12 +168,14 @@ def free_forms(
             if form.share >= WEAK
         ]
         if found:
-            best = max(found, key=lambda f: f.share)
-            plainest = next(f for f in found if f.share >= best.share - NEARLY)
-            first.append([plainest] if plainest is best else [plainest, best])
-            others += [f for f in found if f not in first[-1]]
-    first.sort(key=lambda own: -own[0].hypothesis.gain)
-    return (*(f for own in first for f in own), *sorted(others, key=lambda f: -f.hypothesis.gain))
+            yield found
+
+
+def _leading(found: Sequence[FreeForm]) -> list[FreeForm]:
+    """Of the curves at a joint the plainest that is nearly the best, and the best one."""
+    best = max(found, key=lambda f: f.share)
+    plainest = next(f for f in found if f.share >= best.share - NEARLY)
+    return [plainest] if plainest is best else [plainest, best]
 
 
 def _can_be_at(effect: type[FreeCurve], drive: DriveKind | None) -> bool:

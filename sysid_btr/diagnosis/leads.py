@@ -65,7 +65,7 @@ def curves_of(study: Study, model: Model, library: Library, rules: Selection) ->
 
 
 def replacements(state: State, library: Library, parts: Sequence[IntArray], rules: Selection) -> list[list[Hypothesis]]:
-    """What would explain, to first order, most of what each part of the model does: laws, best first, and a curve.
+    """What would explain, to first order, most of what each part of the model does: laws, best first, and curves.
 
     Parameters
     ----------
@@ -86,7 +86,9 @@ def replacements(state: State, library: Library, parts: Sequence[IntArray], rule
         laws = [h for h in form_hypotheses(own, len(residual), study.scales, rules) if h.gain >= least]
         bare = model.values.copy()
         bare[part] = model.terms.nominal[part]
-        result.append([*laws, *curves_of(study, model.at(bare), library, rules)[:1]])
+        curves = curves_of(study, model.at(bare), library, rules)
+        # at one place, the plainest and the best
+        result.append([*laws, *(h for h in curves[:2] if h.places == curves[0].places)])
     return result
 
 

@@ -148,9 +148,6 @@ class Selection:
     """Fraction of what a curve that is learnt explains, from which a law at its place comes first: most of it. The law
     says more, and a curve can still take up the rest. The same for a law and a special case of it, and for what happens
     once and a law. Judgement."""
-    law_if_periodic: float = 0.9
-    """The same for a curve that is periodic in time and a law of its family, nearly all of it: pulses at its frequency
-    explain 81 % of a sine, and what they leave asks for others beside. Judgement."""
     joins: float = 0.5
     """Fraction of what several laws of a family leave at a joint that a curve in their place may leave at most. A cube
     as a stop and a line: 0.1 (toy leg); the friction of a real axis as dry and viscous: 0.95 (EMPS). Judgement."""
@@ -203,17 +200,11 @@ class Selection:
     rest: float = 0.1
     """Fraction of a column's excess that, left behind by effects that explain the rest, is reported. Judgement."""
 
-    # --- where an effect shows only in what was to be held out ---
+    # --- what is held out ---
 
-    hidden: float = 0.5
-    """Fraction of the held-out excess that must be in columns which are explained where they are fitted: most of
-    it."""
-    least_holdout: float = 0.1
-    """Fraction of a log that stays held out, at least: enough stretches for a paired test."""
-    nearly: float = 0.9
-    """Fraction of an excess that counts as nearly all. Judgement."""
-    brief: int = 3
-    """What happens within fewer stretches of half a second happens once, and cannot be shared out. Judgement."""
+    late: float = 0.5
+    """Fraction of the held-out excess in columns that are explained where they are fitted, from which something shows
+    only at the end of a log: most of it."""
 
     def __repr__(self) -> str:
         """What differs from the standard thresholds, so that signatures stay short."""
@@ -396,11 +387,11 @@ def is_log_explained(rules: Selection, first: Fitted, now: Fitted, *, floating: 
     return all(is_explained(rules, before, after, limit, floating=floating) for before, after in parts)
 
 
-def hidden_columns(rules: Selection, now: Fitted) -> BoolArray | None:
-    """Columns (n,) that are explained where fitted but not where held out; None if most of the excess is elsewhere."""
+def shows_late(rules: Selection, now: Fitted) -> bool:
+    """Whether most of the held-out excess is in columns that are explained where they are fitted."""
+    if len(now.train_columns) != len(now.holdout_columns):
+        return False
     limit = column_limit(rules, now.chance)
-    hidden: BoolArray = (now.train_columns <= limit) & (now.holdout_columns > limit)
+    late = (now.train_columns <= limit) & (now.holdout_columns > limit)
     above = np.maximum(now.holdout_columns - 1, 0.0)
-    if above[hidden].sum() < rules.hidden * above.sum() or not hidden.any():
-        return None
-    return hidden
+    return bool(late.any() and above[late].sum() >= rules.late * above.sum())

@@ -1,4 +1,4 @@
-"""Moving the end of the fitted part, where an effect shows only in what was to be held out."""
+"""What is held out, where the end of a log is no fair judge of what its beginning shows."""
 
 from __future__ import annotations
 
@@ -6,60 +6,62 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.selection import Selection, hidden_columns
-from sysid_btr.identify.refit import Fitted
+from sysid_btr._typing import BoolArray
+from sysid_btr.diagnosis.free_form import follows_time, of_time_alone
+from sysid_btr.diagnosis.selection import Selection, at_floor, shows_late
+from sysid_btr.diagnosis.state import State
+from sysid_btr.identify.missing_torque import missing_torques
 from sysid_btr.identify.study import Study
+from sysid_btr.io.split import held_out_all_over
 from sysid_btr.objectives.problem import BLOCK
+from sysid_btr.terms.model import Model
+
+PARTS = 20
+"""Of a log, at most; none is shorter than the stretches by which models are compared. A curve of time bends five times
+along it, and what is held out is then short beside a bend."""
 
 
-def later_split(study: Study, fitted: Fitted, rules: Selection) -> Study | None:
-    """The study with half of the held-out excess moved to the fitted part; None where that is no help.
+def held_out_elsewhere(state: State, rules: Selection) -> Study | None:
+    """The study with parts held out all over its logs, where their ends alone would judge amiss; None elsewhere.
+
+    A function of time is known between data, not beyond them, and what shows only at the end is not in what is before.
+    Blocked cross-validation: Burman, Chow and Nolan 1994, doi:10.1093/biomet/81.2.351.
 
     Parameters
     ----------
-    study : as laid out.
-    fitted : a model that explains the fitted part, but not the held-out one.
-    rules : what counts as explained, and how much may move.
-
-    Returns
-    -------
-    Study or None
-        None if every column that is above its limit when held out is so when fitted, or if the logs held
-        out are others than those fitted.
+    state : a model, before effects are sought or after.
+    rules : what counts as explained.
     """
-    others = all(episode.scored[0] for episode in study.holdout)
-    if others or not study.procedure.moves_split or len(fitted.train_columns) != len(fitted.holdout_columns):
+    study = state.study
+    at_the_end = all(_is_the_end(held.scored) for held in study.holdout) and len(study.train) == len(study.holdout)
+    if not at_the_end or not study.procedure.holds_out_anywhere or at_floor(rules, state.fitted):
         return None
-    hidden = hidden_columns(rules, fitted)
-    if hidden is None:
+    if not shows_late(rules, state.fitted) and not _of_time(state):
         return None
-    problem = study.holdout_problem(fitted.model)
-    residual = problem.residuals(fitted.model.values[None])[0]
-    labels = problem.column_labels
-    excess = np.where(hidden[labels], residual**2 * problem.inflation[labels] - 1, 0.0)
-    by_block = np.bincount(problem.blocks, np.nan_to_num(excess))
-    train, holdout, first = list(study.train), list(study.holdout), 0
-    for i, episode in enumerate(study.holdout):
-        time = episode.log.time - episode.log.time[0]
-        count = int(time[-1] / BLOCK) + 1
-        cut = cut_time(np.maximum(by_block[first : first + count], 0.0), episode.begin, float(time[-1]), rules)
-        first += count
-        if cut > episode.begin:
-            fitted_now = np.arange(len(episode.scored)) < np.searchsorted(time, cut)
-            train[i], holdout[i] = train[i].scoring(fitted_now), episode.scoring(~fitted_now)
-    if holdout == list(study.holdout):
-        return None
-    return replace(study, train=tuple(train), holdout=tuple(holdout))
+    parts = []
+    for fitted, held in zip(study.train, study.holdout, strict=True):
+        time = held.recording.time
+        many = min(PARTS, int((time[-1] - time[0]) / BLOCK))
+        scored = held_out_all_over(time, float(np.mean(held.scored)), many)
+        if not scored.any():
+            return None
+        parts.append((fitted.scoring(~scored), held.scoring(scored)))
+    train, holdout = zip(*parts, strict=True)
+    # as it was before anything was fitted
+    plain = replace(study, inflation={}, independent=False, redundancy=0.0, held=False, journal=None)
+    numerics = state.first.study.numerics
+    return replace(plain, train=train, holdout=holdout, numerics=numerics).with_initial_states(Model.of(()))
 
 
-def cut_time(excess: FloatArray, now: float, end: float, rules: Selection) -> float:
-    """Time (s) that halves the excess, or that follows all of it where it is brief."""
-    total = float(excess.sum())
-    latest = end - rules.least_holdout * end
-    if total == 0 or now >= latest:
-        return now
-    share = np.cumsum(excess) / total
-    begin, half, nearly = (int(np.searchsorted(share, s)) for s in (1 - rules.nearly, 0.5, rules.nearly))
-    last = nearly if nearly - begin < rules.brief else half
-    return min((last + 1) * BLOCK, latest)
+def _is_the_end(scored: BoolArray) -> bool:
+    """Whether the samples that count are the last ones, and not all."""
+    return not scored[0] and bool(np.all(np.diff(scored.astype(np.int8)) >= 0))
+
+
+def _of_time(state: State) -> bool:
+    """Whether a model has a function of time, or lacks one."""
+    if any(of_time_alone(type(effect)) for effect in state.effects):
+        return True
+    study, model = state.study, state.fitted.model
+    problem = study.train_problem(model)
+    return follows_time(problem, model.values, study.scales, missing_torques(problem, model.values, study.scales))

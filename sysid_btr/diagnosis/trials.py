@@ -9,12 +9,13 @@ from operator import attrgetter
 import numpy as np
 
 from sysid_btr.diagnosis.closing import Candidate
+from sysid_btr.diagnosis.free_form import OF_TIME
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import Selection, at_floor, explains_fitted, improves, improves_once, is_needed
 from sysid_btr.identify.refit import Fitted, best_start, paired_t, refit, shorten
 from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import Effect, family_of
-from sysid_btr.terms.free_form import FREE_FORMS, FreeCurve
+from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import scale_at
 
@@ -104,16 +105,17 @@ def has_law(rules: Selection, hypothesis: Hypothesis, before: Fitted, trials: Se
     )
 
 
-def _laws_beside(rules: Selection, curve: Hypothesis, trials: Sequence[Trial]) -> tuple[list[Trial], float]:
-    """Of several trials those of laws that go before a curve, and the fraction of what it explains that they must.
+def _laws_beside(rules: Selection, other: Hypothesis, trials: Sequence[Trial]) -> tuple[list[Trial], float]:
+    """Laws among several trials that go before a curve, or what happens once, and what part of it they must explain.
 
-    Functions of a robot's state resemble one another along a motion; what is periodic in time resembles no law of
-    another family.
+    Functions of a robot's state resemble one another along a motion. A function of time resembles no law of another
+    family, and one of its own must explain as much as right effects do: pulses at its frequency explain 81 % of a sine,
+    a very slow cyclic error of an encoder 91 % of a drift, and what they leave asks for others beside.
     """
-    places = set(curve.places)
+    places = set(other.places)
     laws = [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
-    if issubclass(curve.effect, FreeCurve) and curve.effect.periodic:
-        return [t for t in laws if family_of(t.hypothesis.effect) == family_of(curve.effect)], rules.law_if_periodic
+    if issubclass(other.effect, OF_TIME):
+        return [t for t in laws if family_of(t.hypothesis.effect) == family_of(other.effect)], rules.explained
     return laws, rules.law
 
 
@@ -206,9 +208,8 @@ def _lasting_first(rules: Selection, before: Fitted, trials: Sequence[Trial], ev
     A push predicts nothing, and what a model lacks shows at some moment the most: where a drive is switched off, where
     a motion is fast.
     """
-    gain, places = _explained(before, event.fitted), set(event.hypothesis.places)
-    laws = [t for t in trials if t.hypothesis.effect not in FREE_FORMS and places & set(t.hypothesis.places)]
-    laws = [t for t in laws if _explained(before, t.fitted) >= rules.law * gain]
+    laws, enough = _laws_beside(rules, event.hypothesis, trials)
+    laws = [t for t in laws if _explained(before, t.fitted) >= enough * _explained(before, event.fitted)]
     return _simplest(rules, laws) if laws else event
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
@@ -69,9 +70,9 @@ def show(result: Mapping[str, Any], out: Console, *, explain: bool = False) -> N
 def _parts(result: Mapping[str, Any], explain: bool) -> Iterator[RenderableType]:
     from rich.text import Text
 
-    verdict = result.get("verdict")
-    headline = f"{verdict.replace('_', ' ')}: {result['message']}" if verdict else result["message"]
-    yield Text(headline, style="bold")
+    verdict, message = (result.get("verdict") or "").replace("_", " "), result["message"]
+    said = not verdict or message.lower().startswith(verdict)
+    yield Text(message if said else f"{verdict}: {message}", style="bold")
     yield errors_table(result)
     for effect in result.get("effects", []):
         yield Text(f"+ {effect['sentence'] or effect['effect']}")
@@ -127,10 +128,19 @@ def certainty_words(effect: Mapping[str, Any]) -> str:
 
 
 def episode_words(result: Mapping[str, Any]) -> Iterator[str]:
-    """How each fitted log was compared with the model, where that is not by one replay of all of it."""
+    """How each log was compared with the model, where that is not by one replay of it whose end is held out."""
     for episode in (*result.get("walks", []), *result.get("episodes", [])):
         if episode["part"] == "train":
             yield "; ".join(_episode_words(episode))
+    for log in result.get("logs", []):
+        for spans in log.get("held_out", []):
+            if len(spans) > 1:
+                seconds = sum(end - begin for begin, end in spans)
+                name = Path(log["path"]).name if log["path"] else "the log"
+                yield (
+                    f"held out of {name}: {len(spans)} parts all over it, {seconds:.3g} s together; what changes along "
+                    "a log cannot be judged at its end alone"
+                )
 
 
 def _episode_words(episode: Mapping[str, Any]) -> Iterator[str]:

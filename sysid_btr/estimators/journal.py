@@ -104,8 +104,8 @@ class _Tape:
 class Journal:
     """Append-only record of evaluations, in memory or in a JSON-lines file.
 
-    Beside the records it keeps the latest *attachment*: one array too large for text (a Jacobian), in
-    ``<path>.<record number>.npy``, replaced when a later record brings its own.
+    Beside the records it keeps the latest *attachment* of each search: one array too large for text (a Jacobian), in
+    ``<path>.<record number>.npy``, replaced when a later record of the search brings its own.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ class Journal:
         self._tape.cursor = len(self._tape.records)
 
     def attachment(self, number: int) -> FloatArray:
-        """The attachment of record `number` (from 0), which must be the latest that has one.
+        """The attachment of record `number` (from 0), which must be the latest of its search that has one.
 
         Raises
         ------
@@ -271,9 +271,10 @@ class Journal:
         if self.path is None:
             return
         keep = self._attachment_path(self.path, number)
-        own = re.compile(re.escape(self.path.name) + r"\.\d+\.npy")
+        own = re.compile(re.escape(self.path.name) + r"\.(\d+)\.npy")
         for old in self.path.parent.iterdir():
-            if own.fullmatch(old.name) and old != keep:
+            found = own.fullmatch(old.name)
+            if found and old != keep and int(found[1]) >= self._origin:
                 old.unlink(missing_ok=True)
 
     def _write(self, line: bytes, *, sync: bool) -> None:

@@ -58,7 +58,7 @@ class FloatingProcedure(Procedure):
     deferred: ClassVar[bool] = True
     refines_step: ClassVar[bool] = False
     weighs_segments: ClassVar[bool] = True
-    moves_split: ClassVar[bool] = False
+    holds_out_anywhere: ClassVar[bool] = False
     fuses: ClassVar[bool] = True
     costly: ClassVar[bool] = True
     on_ground: ClassVar[bool] = True

@@ -319,7 +319,7 @@ class InnovationsProcedure(Procedure):
     last_turns: ClassVar[int] = 8
     coarse_suffices: ClassVar[bool] = True
     refines_step: ClassVar[bool] = False
-    moves_split: ClassVar[bool] = False
+    holds_out_anywhere: ClassVar[bool] = False
     costly: ClassVar[bool] = True
     no_torque: ClassVar[str] = "its base was floating, and samples are compared one by one"
     unseen: ClassVar[str] = (

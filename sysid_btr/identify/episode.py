@@ -79,7 +79,7 @@ class Procedure:
     deferred : whether derivatives are always taken by a cheaper integrator.
     refines_step : whether half the step, where that moves an estimate, is nearer to the truth.
     weighs_segments : whether segments are weighed one by one, by what is left in them under the columns' noise.
-    moves_split : whether the end of the fitted part can be moved.
+    holds_out_anywhere : whether what is held out may lie all over a recording.
     wanders : whether parameters may be fitted far from where they belong where something is missing, as errors of the
         model grow in a replay.
     fuses : whether `fuse` has more to say than the residuals.
@@ -101,7 +101,7 @@ class Procedure:
     deferred: ClassVar[bool] = False
     refines_step: ClassVar[bool] = True
     weighs_segments: ClassVar[bool] = False
-    moves_split: ClassVar[bool] = True
+    holds_out_anywhere: ClassVar[bool] = True
     wanders: ClassVar[bool] = False
     fuses: ClassVar[bool] = False
     costly: ClassVar[bool] = False

@@ -14,6 +14,7 @@ from sysid_btr.identify.residuals import residuals
 from sysid_btr.identify.scores import ChannelScore, Scores
 from sysid_btr.identify.sensitivity import sensitivity_table
 from sysid_btr.identify.study import Study
+from sysid_btr.io.split import spans_of
 from sysid_btr.models.robot import channel_units
 from sysid_btr.result import SCHEMA, clean, versions
 from sysid_btr.simulation.numerics import MUJOCO
@@ -212,6 +213,11 @@ def _logs(study: Study) -> list[dict[str, Any]]:
                 "sha256": None if path is None else sha256(path),
                 "used_for": parts,
                 "recorded": dates[path],
+                "held_out": [
+                    spans_of(episode.recording.time, episode.scored)
+                    for episode in study.holdout
+                    if episode.log.path == path
+                ],
             }
         )
     return entries

@@ -61,7 +61,6 @@ class SegmentedProcedure(Procedure):
     demand: ClassVar[int] = 1
     alternations: ClassVar[tuple[int, ...]] = (5, 5, 5)
     shares: ClassVar[tuple[float, ...]] = SHARES
-    moves_split: ClassVar[bool] = False
     wanders: ClassVar[bool] = True
     no_torque: ClassVar[str] = "the replay fails, or too little of it moves"
 
@@ -99,7 +98,7 @@ class SegmentedEpisode(Episode):
         tracks = measured_motion(robot, log)
         length = follow(robot, log, threads) if seconds is None else seconds
         every = np.ones(len(log), dtype=bool)
-        return cls(robot, log, every, tracks, _cut(log, tracks, length, 0, len(log)), length)
+        return cls(robot, log, every, tracks, _cut(log, tracks, length, every), length)
 
     @classmethod
     def split(
@@ -112,16 +111,17 @@ class SegmentedEpisode(Episode):
         LogError
             If no joint's position is logged, or a part would be too short.
         """
-        count = len(holdout_split(log, holdout)[0])
-        tracks, fitted = measured_motion(robot, log), np.arange(len(log)) < count
-        length = follow(robot, log, threads) if seconds is None else seconds
-        parts = ((fitted, 0, count), (~fitted, count, len(log)))
-        first, last = (cls(robot, log, own, tracks, _cut(log, tracks, length, a, b), length) for own, a, b in parts)
-        return first, last
+        fitted = np.arange(len(log)) < len(holdout_split(log, holdout)[0])
+        both = cls.whole(robot, log, threads, seconds=seconds)
+        return both.scoring(fitted), both.scoring(~fitted)
+
+    def scoring(self, scored: BoolArray) -> SegmentedEpisode:
+        """The same with other samples that count, and with segments that start anew from measured states."""
+        cut = _cut(self.recording, self.tracks, self.seconds, scored)
+        return replace(self, scored=scored, segments=cut, marginal=None)
 
     def with_share(self, share: float) -> SegmentedEpisode:
-        rows = np.flatnonzero(self.scored)
-        cut = _cut(self.recording, self.tracks, share * self.seconds, int(rows[0]), int(rows[-1]) + 1)
+        cut = _cut(self.recording, self.tracks, share * self.seconds, self.scored)
         return replace(self, segments=cut, marginal=None)
 
     @property
@@ -266,9 +266,11 @@ def _smoothed(log: Log, joints: Sequence[str], known: Sequence[int], rest: Float
     return Tracks(position, velocity, acceleration, position_std, velocity_std)
 
 
-def _cut(log: Log, tracks: Tracks, seconds: float, begin: int, end: int) -> Segments:
-    """Segments of about so many seconds that tile the samples from `begin` to before `end`."""
+def _cut(log: Log, tracks: Tracks, seconds: float, scored: BoolArray) -> Segments:
+    """Segments of about so many seconds that tile the samples (n,) from the first that counts to the last."""
     period = float(np.median(np.diff(log.time)))
+    rows = np.flatnonzero(scored)
+    begin, end = int(rows[0]), int(rows[-1]) + 1
     most = max((end - begin) // FEWEST, 1)
     count = int(np.clip(round((end - begin) * period / seconds), 1, most))
     borders = np.linspace(begin, end, count + 1).round().astype(np.int64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._clock import typical_interval
 from sysid_btr.io.log import Log
@@ -46,6 +47,32 @@ def holdout_split(log: Log, holdout: float = 0.3) -> tuple[Log, Log]:
             "record more, or give a second log to hold out"
         )
     return log.window(0, cut), log.window(cut, len(log))
+
+
+def held_out_all_over(time: FloatArray, share: float, parts: int) -> BoolArray:
+    """Samples to hold out where all of a recording is to be seen: every n-th of its parts, but not the last one.
+
+    Parameters
+    ----------
+    time : (n,) s.
+    share : about the fraction of the time to hold out.
+    parts : of equal duration, into which it is cut.
+
+    Returns
+    -------
+    BoolArray
+        (n,) samples that are held out; none where there are too few parts.
+    """
+    every = max(round(1 / share), 2)
+    part = np.minimum(parts * (time - time[0]) / (time[-1] - time[0]), parts - 1).astype(np.int64)
+    return np.asarray((part % every == every - 1) & (part < parts - 1))
+
+
+def spans_of(time: FloatArray, samples: BoolArray) -> tuple[tuple[float, float], ...]:
+    """First and last time, s since the first sample, of each run of samples, (n,), that follow one another."""
+    ends = np.flatnonzero(np.diff(samples, prepend=False, append=False)).reshape(-1, 2)
+    since = time - time[0]
+    return tuple((float(since[begin]), float(since[end - 1])) for begin, end in ends)
 
 
 def split_episodes(log: Log) -> tuple[Log, ...]:

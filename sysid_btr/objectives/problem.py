@@ -307,7 +307,7 @@ class ReplayProblem:
 def of_both(
     fitted: ReplayProblem, heldout: ReplayProblem, look: Callable[[ReplayProblem], FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """What is seen of two problems, (r,) each; one replay shows both where the one's logs begin the other's.
+    """What is seen of two problems, (r,) each; one replay shows both where the one's log begins the other's.
 
     Parameters
     ----------
@@ -315,10 +315,11 @@ def of_both(
     look : gives a number for every residual of a problem.
     """
     pairs = list(zip(fitted.episodes, heldout.episodes, strict=False))
-    if len(fitted.episodes) != len(heldout.episodes) or not all(_begins(a.replay, b.replay) for a, b in pairs):
+    longer = [b if _begins(a.replay, b.replay) else a if _begins(b.replay, a.replay) else None for a, b in pairs]
+    if len(fitted.episodes) != len(heldout.episodes) or None in longer:
         return look(fitted), look(heldout)
-    joined = tuple(replace(b, targets=(*a.targets, *b.targets)) for a, b in pairs)
-    seen = look(replace(heldout, episodes=joined))
+    joined = (replace(e, targets=(*a.targets, *b.targets)) for e, (a, b) in zip(longer, pairs, strict=True) if e)
+    seen = look(replace(heldout, episodes=tuple(joined)))
     owner = [(b, int(t.mask.sum())) for pair in pairs for b, e in enumerate(pair) for t in e.targets]
     second = np.repeat([b == 1 for b, _ in owner], [n for _, n in owner])
     return seen[~second], seen[second]

@@ -159,7 +159,7 @@ function signals() {
     lines.push(line(`log − ${name}`, of(s.residual[k], factor), data.colours[k], { trace: { yaxis: "y2", showlegend: false } }));
   });
   const rectangle = (more, fillcolor) => ({ type: "rect", layer: "below", line: { width: 0 }, fillcolor, ...more });
-  const held = 0 < episode().split && episode().split < end;
+  const held = episode().held_out.length > 1 || episode().held_out[0][0] > time[0] ? episode().held_out : [];
   const layout = base(narrow() ? 430 : 520, {
     hovermode: "x", showlegend: true, uirevision: `${state.episode}`,
     legend: { orientation: "h", x: 0, y: 1.01, yanchor: "bottom", bgcolor: "rgba(0,0,0,0)" },
@@ -168,11 +168,11 @@ function signals() {
     yaxis: axis({ domain: [0.4, 1], title: { text: `${s.joint} (${s.unit})`, standoff: 6 } }),
     yaxis2: axis({ domain: [0, 0.33], title: { text: `log − model (${unit})`, standoff: 6 } }),
     shapes: [
-      ...(held ? [rectangle({ xref: "x", yref: "paper", x0: episode().split, x1: end, y0: 0, y1: 1 }, "#388bfd24")] : []),
+      ...held.map(([x0, x1]) => rectangle({ xref: "x", yref: "paper", x0, x1, y0: 0, y1: 1 }, "#388bfd24")),
       rectangle({ xref: "paper", yref: "y2", x0: 0, x1: 1, y0: -2 * s.noise / factor, y1: 2 * s.noise / factor }, css("--faint") + "55"),
     ],
     annotations: [
-      ...(held ? [{ text: "held out", xref: "x", yref: "paper", x: episode().split, y: 1, xanchor: "left", yanchor: "top", showarrow: false, font: { size: 11, color: css("--faint") } }] : []),
+      ...held.slice(0, 1).map(([x]) => ({ text: "held out", xref: "x", yref: "paper", x, y: 1, xanchor: "left", yanchor: "top", showarrow: false, font: { size: 11, color: css("--faint") } })),
       { text: "band: 2 × noise", xref: "paper", yref: "paper", x: 1, y: 0.33, xanchor: "right", yanchor: "bottom", showarrow: false, font: { size: 11, color: css("--faint") } },
     ],
   });
@@ -387,8 +387,9 @@ function select(wanted) {
 }
 function start() {  // where the first model is farthest off in what is held out
   const s = sensor(), e = episode();
-  let best = 0, at = e.split;
-  e.time.forEach((t, i) => { const r = Math.abs(s.residual[0][i]); if (t >= e.split && r > best) { best = r; at = t; } });
+  const held = t => e.held_out.some(([begin, end]) => begin <= t && t <= end);
+  let best = 0, at = e.held_out[0][0];
+  e.time.forEach((t, i) => { const r = Math.abs(s.residual[0][i]); if (r > best && held(t)) { best = r; at = t; } });
   return at;
 }
 function wire() {

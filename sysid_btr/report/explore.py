@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.io.split import spans_of
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.report.bodies import Body, bodies_of, filled, placed
 from sysid_btr.report.guide import about_verdict
@@ -27,7 +28,7 @@ from sysid_btr.report.traces import Played, PlayedEpisode, Trace
 from sysid_btr.result import clean
 from sysid_btr.run_folder import DRAWS, MODEL, PARAMS, REPORT, RESULT
 
-SCHEMA = "sysid_btr.explore/1"
+SCHEMA = "sysid_btr.explore/2"
 """Of what explore.js reads."""
 MOST_NUMBERS = 600_000
 """Numbers of all series together; of longer logs every other sample is left out, or more."""
@@ -65,7 +66,7 @@ def _episode(played: Played, item: PlayedEpisode, stride: int, bodies: tuple[Bod
     return {
         "label": item.label or (log.path.stem if log.path is not None else "the log"),
         "time": packed((log.time - log.time[0])[::stride], "f4"),
-        "split": item.episode.begin,
+        "held_out": spans_of(log.time, item.episode.scored[: len(log)]),
         "channels": list(dict.fromkeys(trace.channel for trace in item.traces)),
         "sensors": [_sensor(trace, stride) for trace in ordered],
         "scene": _scene(item, bodies, frames) if bodies else None,

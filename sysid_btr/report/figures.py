@@ -26,7 +26,7 @@ MOST_POINTS = 4000
 
 
 def plot_overlay(traces: Sequence[Trace], figure: Figure | None = None) -> Any:
-    """The traces: whole log, a close-up of the held-out part, and the residual there.
+    """The traces: whole log, a close-up of what is held out, and the residual there.
 
     Parameters
     ----------
@@ -150,11 +150,12 @@ def _draw_row(row: Sequence[Axes], item: Trace) -> None:
     for axis, (begin, end) in ((whole, (item.time[0], item.time[-1])), (close, (low, high))):
         _draw_lines(axis, item, begin, end)
         axis.set_xlim(begin, end)
-    if 0 < item.split < item.time[-1]:
-        whole.axvspan(item.split, item.time[-1], color=SHADE, lw=0)
-        whole.text(item.split, 1.0, " held out", transform=whole.get_xaxis_transform(), va="top", fontsize=8)
+    if not item.held_out.all():
+        for begin, end in item.spans:
+            whole.axvspan(begin, end, color=SHADE, lw=0)
+        whole.text(item.spans[0][0], 1.0, " held out", transform=whole.get_xaxis_transform(), va="top", fontsize=8)
     whole.set_ylabel(f"{item.joint} ({item.unit})")
-    close.set_title("close-up of the held-out part", fontsize=9)
+    close.set_title("close-up of what is held out", fontsize=9)
     factor, unit = _milli(item)
     for name, colour in _coloured(item):
         x, y = _window(item.time, (item.measured - item.predicted[name]) * factor, low, high)
@@ -194,14 +195,11 @@ def _milli(item: Trace) -> tuple[float, str]:
 
 
 def _zoom(item: Trace) -> tuple[float, float]:
-    """Two seconds of the held-out part around the first model's largest smoothed residual."""
-    inside = np.flatnonzero(item.time >= item.split)
-    if len(inside) < 2:
-        inside = np.arange(len(item.time))
-    time = item.time[inside]
+    """Two seconds around the first model's largest smoothed residual in what is held out."""
+    time = item.time[int(np.argmax(item.held_out)) :]
     span = min(ZOOM_SECONDS, time[-1] - time[0])
     first = next(iter(item.predicted.values()))
-    square = np.nan_to_num((item.measured - first)[inside]) ** 2
+    square = np.where(item.held_out, np.nan_to_num(item.measured - first) ** 2, 0.0)[-len(time) :]
     energy = np.concatenate(([0.0], np.cumsum(square)))
     stop = np.searchsorted(time, time + span, side="right")
     starts = np.flatnonzero(time + span <= time[-1] + 1e-9)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.io.split import spans_of
 from sysid_btr.mujoco_conventions import slides
 from sysid_btr.objectives.targets import COMPARED, Target
 from sysid_btr.terms.model import Model
@@ -39,7 +40,7 @@ class Trace:
     time : (n,) s since the first sample.
     command, measured : (n,) NaN where missing; the command is a position whatever is compared.
     predicted : name of the model -> (n,), from the plain model to the final one.
-    split : (s) held out from here on.
+    held_out : (n,) samples that were not fitted.
     noise : noise floor of the sensor.
     errors : name of the model -> root-mean-square error of the samples that are scored, as scores have it.
     """
@@ -51,17 +52,17 @@ class Trace:
     command: FloatArray
     measured: FloatArray
     predicted: Mapping[str, FloatArray]
-    split: float
+    held_out: BoolArray
     noise: float
     errors: Mapping[str, float]
 
     @property
-    def held_out(self) -> BoolArray:
-        """(n,) samples from the split on."""
-        return np.asarray(self.time >= self.split)
+    def spans(self) -> tuple[tuple[float, float], ...]:
+        """Begin and end, s, of what is held out."""
+        return spans_of(self.time, self.held_out)
 
     def residual(self, name: str) -> FloatArray:
-        """(m,) log minus model on the held-out part; NaN where nothing was measured."""
+        """(m,) log minus model on what is held out; NaN where nothing was measured."""
         return np.asarray((self.measured - self.predicted[name])[self.held_out])
 
     def error(self, name: str) -> float:
@@ -177,7 +178,7 @@ def _traces(
             command=log.channels.get(f"command.{joint}", np.full(len(log), np.nan)),
             measured=target.measured[:, k],
             predicted={name: p[:, k] for name, p in predicted.items()},
-            split=episode.begin,
+            held_out=episode.scored[: len(log)],
             noise=float(target.noise[k]),
             errors={name: _root_mean_square(error[:, k]) for name, error in errors.items()},
         )
