@@ -109,18 +109,42 @@ def curves_together(curves: Sequence[Hypothesis], rules: Selection) -> list[Hypo
     curves : at a joint each; the first of a joint is the best there, and others do not count.
     rules : how much a joint must explain beside the one that explains most, and how many numbers a hypothesis may add.
     """
-    best: dict[str, Hypothesis] = {}
-    for curve in curves:
-        best.setdefault(curve.places[0], curve)
     result = []
-    for effect in dict.fromkeys(h.effect for h in best.values()):
-        lead, *others = sorted((h for h in best.values() if h.effect is effect), key=lambda h: -h.gain)
+    for effect, own in _best_by_effect(curves).items():
+        lead, *others = own
         alike = [lead, *(h for h in others if h.gain >= rules.location_rival * lead.gain)]
         alike = alike[: max(rules.most_parameters // len(effect.kinds), 1)]
         if len(alike) > 1:
             places, start = tuple(h.places[0] for h in alike), np.concatenate([h.start for h in alike])
             result.append(Hypothesis(effect, places, False, start, sum(h.gain for h in alike)))
     return sorted(result, key=lambda h: -h.gain)
+
+
+def curves_of_all(curves: Sequence[Hypothesis], library: Sequence[type[Effect]]) -> list[Hypothesis]:
+    """The curve for which several joints ask as one of all the robot, where the library has it: what all drives share.
+
+    Parameters
+    ----------
+    curves : as for `curves_together`; how much each joint explains does not matter.
+    library : effects that are considered.
+    """
+    return [
+        Hypothesis(kind, ("robot",), False, own[0].start, sum(h.gain for h in own))
+        for effect, own in _best_by_effect(curves).items()
+        for kind in library
+        if len(own) > 1 and kind.scope == "robot" and issubclass(kind, effect)
+    ]
+
+
+def _best_by_effect(curves: Sequence[Hypothesis]) -> dict[type[Effect], list[Hypothesis]]:
+    """Of each effect the joints where it is the best curve, those first that explain most."""
+    best: dict[str, Hypothesis] = {}
+    for curve in curves:
+        best.setdefault(curve.places[0], curve)
+    result: dict[type[Effect], list[Hypothesis]] = {}
+    for curve in sorted(best.values(), key=lambda h: -h.gain):
+        result.setdefault(curve.effect, []).append(curve)
+    return result
 
 
 def to_arrays(

@@ -11,7 +11,14 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.diagnosis.free_form import free_forms
-from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_together, form_hypotheses, from_arrays, to_arrays
+from sysid_btr.diagnosis.hypotheses import (
+    Hypothesis,
+    curves_of_all,
+    curves_together,
+    form_hypotheses,
+    from_arrays,
+    to_arrays,
+)
 from sysid_btr.diagnosis.proposals import proposals
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, perturbations, responding, scan
 from sysid_btr.diagnosis.selection import Selection, could_gain
@@ -45,7 +52,9 @@ def leading_hypotheses(state: State, library: Library, rules: Selection) -> tupl
     found, residuals = _scan(state, [e for e in library if e not in FREE_FORMS], rules)
     hypotheses = form_hypotheses(found, residuals, state.study.scales, rules)
     if could_gain(rules, state.before, state.fitted, learnt=bool(state.effects)):
-        hypotheses += curves_of(state.study, state.fitted.model, library, rules)
+        scanned = {(h.effect, h.places) for h in hypotheses}
+        curves = curves_of(state.study, state.fitted.model, library, rules)
+        hypotheses += [h for h in curves if (h.effect, h.places) not in scanned]
     if study.journal is not None:
         arrays = {**to_arrays(hypotheses, library, places), "answers": np.array(len(found)), "loss": np.zeros(1)}
         seconds = study.journal.seconds + perf_counter() - began
@@ -61,7 +70,7 @@ def curves_of(study: Study, model: Model, library: Library, rules: Selection) ->
     problem = study.train_problem(model)
     forms = free_forms(problem, model.values, study.scales, missing_torques(problem, model.values, study.scales))
     own = [f.hypothesis for f in forms if f.hypothesis.effect in asked and f.hypothesis.gain >= rules.candidate_gain]
-    return [*curves_together(own, rules), *own][: rules.curves]
+    return [*curves_of_all(own, library), *curves_together(own, rules), *own][: rules.curves]
 
 
 def replacements(state: State, library: Library, parts: Sequence[IntArray], rules: Selection) -> list[list[Hypothesis]]:

@@ -33,7 +33,6 @@ class InverseProcedure(Procedure):
     """How a fit goes about torques of a measured motion: nothing is integrated, so no step needs refining."""
 
     refines_step: ClassVar[bool] = False
-    holds_out_anywhere: ClassVar[bool] = False
     replayed: ClassVar[bool] = False
     no_torque: ClassVar[str] = "too little of it moves"
     unseen: ClassVar[str] = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -151,8 +152,8 @@ def _draw_row(row: Sequence[Axes], item: Trace) -> None:
         _draw_lines(axis, item, begin, end)
         axis.set_xlim(begin, end)
     if not item.held_out.all():
-        for begin, end in item.spans:
-            whole.axvspan(begin, end, color=SHADE, lw=0)
+        for axis, (begin, end) in product((whole, close) if len(item.spans) > 1 else (whole,), item.spans):
+            axis.axvspan(begin, end, color=SHADE, lw=0)
         whole.text(item.spans[0][0], 1.0, " held out", transform=whole.get_xaxis_transform(), va="top", fontsize=8)
     whole.set_ylabel(f"{item.joint} ({item.unit})")
     close.set_title("close-up of what is held out", fontsize=9)

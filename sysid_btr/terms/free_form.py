@@ -412,7 +412,6 @@ class FreeTorqueTime(FreeTorque):
     title: ClassVar[str] = "torque that changes slowly with time"
     variable: ClassVar[str] = "time"
     variable_unit: ClassVar[str] = "s"
-    transient: ClassVar[bool] = True
     includes: ClassVar[tuple[str, ...]] = ("constant_force",)
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (("voltage_sag", "a load that is not always the same"),)
 
@@ -511,7 +510,6 @@ class FreeGainTime(FreeCurve):
     variable: ClassVar[str] = "time"
     variable_unit: ClassVar[str] = "s"
     amount: ClassVar[str] = "change of gain"
-    transient: ClassVar[bool] = True
     law_acts: ClassVar[tuple[str, ...]] = ("servo",)
     first_mode: ClassVar[int] = 1
     """The constant is the gain itself."""
@@ -759,7 +757,6 @@ class FreeReadingTime(FreeReading):
     title: ClassVar[str] = "error of the encoder that changes slowly with time"
     variable: ClassVar[str] = "time"
     variable_unit: ClassVar[str] = "s"
-    transient: ClassVar[bool] = True
     confounders: ClassVar[tuple[tuple[str, str], ...]] = (
         ("free_torque.time", "a logged effort, or motion whose stiffness to torque changes"),
     )
