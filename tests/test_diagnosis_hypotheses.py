@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_together, form_hypotheses
+from sysid_btr.diagnosis.hypotheses import Hypothesis, curves_of_all, curves_together, form_hypotheses
 from sysid_btr.diagnosis.scan import Perturbation, Residual, Sensitivity, perturbations
 from sysid_btr.diagnosis.selection import STANDARD
-from sysid_btr.terms.free_form import FreeCurve, FreeFrictionSpeed, FreeTorquePeriodic, FreeTorquePosition
+from sysid_btr.terms.free_form import (
+    FreeCurve,
+    FreeFrictionSpeed,
+    FreeGainOfAll,
+    FreeGainTime,
+    FreeTorquePeriodic,
+    FreeTorquePosition,
+)
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.scales import JointScale, Scales
 from sysid_btr.terms.spring import JointSpring
@@ -108,6 +115,23 @@ def test_curves_that_are_the_best_of_several_joints_are_one_hypothesis_with_the_
     assert one.gain == 1600.0
     np.testing.assert_array_equal(one.start, np.repeat([900.0, 700.0], len(FreeTorquePeriodic.kinds)))
     assert curves_together(found[2:3], STANDARD) == []
+
+
+def test_a_gain_that_several_drives_ask_for_is_asked_of_all_where_it_is_sought() -> None:
+    found = [
+        Hypothesis(effect, (joint,), False, np.full(len(effect.kinds), gain), gain)
+        for effect, joint, gain in (
+            (FreeGainTime, "left", 900.0),
+            (FreeTorquePosition, "right", 500.0),
+            (FreeGainTime, "right", 400.0),  # not the best of its joint
+            (FreeGainTime, "middle", 60.0),
+        )
+    ]
+    (one,) = curves_of_all(found, (CoulombFriction, FreeGainOfAll))
+    assert (one.effect, one.places, one.gain) == (FreeGainOfAll, ("robot",), 960.0)
+    np.testing.assert_array_equal(one.start, found[0].start)
+    assert curves_of_all(found, (CoulombFriction, FreeGainTime)) == []
+    assert curves_of_all(found[:2], (FreeGainOfAll,)) == [], "one drive alone"
 
 
 def test_what_may_be_alike_everywhere_is_asked_at_joints_that_limbs_have_in_common() -> None:

@@ -56,12 +56,12 @@ from sysid_btr.identify.scores import Scores
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.disturbance import ExternalDisturbance
 from sysid_btr.terms.effect import Effect
-from sysid_btr.terms.free_form import FreeFrictionSpeed, FreeTorqueLoad, FreeTorquePeriodic
+from sysid_btr.terms.free_form import FreeFrictionSpeed, FreeReadingTime, FreeTorqueLoad, FreeTorquePeriodic
 from sysid_btr.terms.friction import CoulombFriction, LoadFriction, LoadFrictionLarger, StribeckFriction, ViscousDamping
 from sysid_btr.terms.inertial import Mass, Payload
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.scales import JointScale, Scales
-from sysid_btr.terms.sensing import SensorDelay
+from sysid_btr.terms.sensing import EncoderCyclicError, SensorDelay
 from sysid_btr.terms.servo import CommandDelay
 
 RULES = Selection()
@@ -449,9 +449,11 @@ def of(effect: type[Effect], held_out: float, gain: float = 0.0) -> Trial:
         (FreeFrictionSpeed, ViscousDamping, 40.0, True),  # most of what the curve does
         (FreeFrictionSpeed, ViscousDamping, 60.0, False),
         (FreeTorqueLoad, ViscousDamping, 40.0, True),
-        (FreeTorquePeriodic, ExternalDisturbance, 5.0, True),  # nearly all of it
-        (FreeTorquePeriodic, ExternalDisturbance, 20.0, False),
-        (FreeTorquePeriodic, ViscousDamping, 5.0, False),  # nothing of the robot has a clock of its own
+        (FreeTorquePeriodic, ExternalDisturbance, 3.0, True),  # nearly all of it
+        (FreeTorquePeriodic, ExternalDisturbance, 4.0, False),
+        (FreeTorquePeriodic, ViscousDamping, 2.0, False),  # nothing of the robot has a clock of its own
+        (FreeReadingTime, EncoderCyclicError, 10.0, False),
+        (FreeReadingTime, EncoderCyclicError, 2.0, True),
     ],
 )
 def test_a_law_goes_before_a_curve_if_it_explains_enough_of_the_same(

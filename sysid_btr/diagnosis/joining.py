@@ -59,6 +59,8 @@ def _as_curve(state: State, group: tuple[Effect, ...], library: Library, rules: 
         return state
     known = list(zip(state.effects, state.evidence, strict=True))
     own = reduce(Evidence.joined, (evidence for effect, evidence in known if effect in group))
+    # a law that it replaces is no rival
+    own = own.beside([effect.name for effect in group])
     staying = tuple(evidence for effect, evidence in known if effect not in group)
     state = replace(state, fitted=trial.fitted, evidence=(*staying, own))
     return state.step(added=(str(curve),), removed=[f"{one.name} at {', '.join(places)}" for one in group])
