@@ -106,3 +106,12 @@ def test_what_acts_beside_a_function_of_time_is_found_and_a_run_resumes(tmp_path
     done = kept.read_bytes()
     assert np.array_equal(closing(journal=Journal(kept)).values, found.values)
     assert kept.read_bytes() == done, "nothing that was done is done again"
+
+
+def test_the_end_of_a_log_that_is_too_short_for_parts_stays_held_out() -> None:
+    late = recorded(FRICTION, still=7.2)
+    study = make_study(toys.leg(), [late.window(0, 101), late], numerics=Numerics("RK4", 0.005), threads=1)
+    spread = held_out_elsewhere(State.of(fit(study, FREE), None), STANDARD)
+    assert spread is not None
+    assert np.array_equal(spread.holdout[0].scored, study.holdout[0].scored)
+    assert not spread.holdout[1].scored[-1]

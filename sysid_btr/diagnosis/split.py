@@ -38,19 +38,21 @@ def held_out_elsewhere(state: State, rules: Selection) -> Study | None:
         return None
     if not shows_late(rules, state.fitted) and not _of_time(state):
         return None
-    parts = []
-    for fitted, held in zip(study.train, study.holdout, strict=True):
+    train, holdout = list(study.train), list(study.holdout)
+    for i, held in enumerate(study.holdout):
         time = held.recording.time
         many = min(PARTS, int((time[-1] - time[0]) / BLOCK))
         scored = held_out_all_over(time, float(np.mean(held.scored)), many)
-        if not scored.any():
-            return None
-        parts.append((fitted.scoring(~scored), held.scoring(scored)))
-    train, holdout = zip(*parts, strict=True)
+        if scored.any():
+            train[i], holdout[i] = train[i].scoring(~scored), held.scoring(scored)
+    if holdout == list(study.holdout):
+        return None
     # as it was before anything was fitted
     plain = replace(study, inflation={}, independent=False, redundancy=0.0, held=False, journal=None)
     numerics = state.first.study.numerics
-    return replace(plain, train=train, holdout=holdout, numerics=numerics).with_initial_states(Model.of(()))
+    return replace(plain, train=tuple(train), holdout=tuple(holdout), numerics=numerics).with_initial_states(
+        Model.of(())
+    )
 
 
 def _is_the_end(scored: BoolArray) -> bool:

@@ -3,7 +3,7 @@ const $ = id => document.getElementById(id);
 const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const KINDS = { f4: Float32Array, i2: Int16Array, u2: Uint16Array };
 const array = packed => new KINDS[packed.type](bytes(packed.data).buffer);
-const SCHEMA = "sysid_btr.explore/1";
+const SCHEMA = "sysid_btr.explore/2";
 const MOST_POINTS = 4000, STRETCHES = 300, NARROW = 600;
 const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const touch = matchMedia("(pointer: coarse)").matches;  // there a finger on a picture scrolls the page
