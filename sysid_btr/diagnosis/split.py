@@ -48,11 +48,8 @@ def held_out_elsewhere(state: State, rules: Selection) -> Study | None:
     if holdout == list(study.holdout):
         return None
     # as it was before anything was fitted
-    plain = replace(study, inflation={}, independent=False, redundancy=0.0, held=False, journal=None)
-    numerics = state.first.study.numerics
-    return replace(plain, train=tuple(train), holdout=tuple(holdout), numerics=numerics).with_initial_states(
-        Model.of(())
-    )
+    plain = replace(state.first.study, inflation={}, independent=False, redundancy=0.0, held=False, journal=None)
+    return replace(plain, train=tuple(train), holdout=tuple(holdout)).with_initial_states(Model.of(()))
 
 
 def _is_the_end(scored: BoolArray) -> bool:
