@@ -24,7 +24,6 @@ from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.terms.base import Term
 from sysid_btr.terms.friction import CoulombFriction
-from sysid_btr.terms.transmission import Backlash
 
 FREE = ("mass:knee",)
 SECONDS = 10.0
@@ -92,17 +91,23 @@ def test_another_log_that_is_held_out_stays_held_out() -> None:
     assert held_out_elsewhere(State.of(fit(study, FREE), None), STANDARD) is None
 
 
-def test_what_acts_beside_a_function_of_time_is_found_and_a_run_resumes(tmp_path: Path) -> None:
-    play, kept = (Backlash(("knee",)), np.array([0.03, 0.0])), tmp_path / "journal.jsonl"
-    study = make_study(toys.leg(), [drifting(recorded(play), "hip")], threads=1)
-    closing = partial(close, study, FREE, effects=("backlash", "encoder_offset", "free_reading"))
-    found = closing(journal=Journal(kept))
+def test_what_acts_beside_a_function_of_time_is_found_and_the_result_says_what_was_held_out() -> None:
+    log = drifting(recorded(FRICTION), "knee")
+    study = make_study(toys.leg(), [log], numerics=Numerics("RK4", 0.005), threads=1)
+    found = close(study, FREE, effects=("coulomb_friction", "viscous_damping", "free_reading"))
     assert found.verdict == "explained", found.message
-    assert {(e.family, e.where) for e in found.effects} == {("backlash", ("knee",)), ("sensor", ("hip",))}
-    (size,) = [p for e in found.effects for p in e.parameters if p.name == "backlash.play:knee"]
-    assert size.ci95[0] <= 0.03 <= size.ci95[1]
+    assert {(e.family, e.where) for e in found.effects} == {("friction", ("hip",)), ("sensor", ("knee",))}
+    (size,) = [p for e in found.effects for p in e.parameters if p.name == "coulomb_friction:hip"]
+    assert size.value == pytest.approx(0.15, rel=0.02)
     (words,) = [line for line in episode_words(found.to_dict()) if "held out" in line]
     assert words.startswith("held out of the log: 6 parts all over it, 2.9")
+
+
+def test_a_run_that_began_anew_resumes(tmp_path: Path) -> None:
+    kept, log = tmp_path / "journal.jsonl", drifting(recorded(), "hip")
+    study = make_study(toys.leg(), [log], numerics=Numerics("RK4", 0.005), threads=1)
+    closing = partial(close, study, FREE, effects=("free_reading",))
+    found = closing(journal=Journal(kept))
     done = kept.read_bytes()
     assert np.array_equal(closing(journal=Journal(kept)).values, found.values)
     assert kept.read_bytes() == done, "nothing that was done is done again"
