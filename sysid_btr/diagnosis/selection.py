@@ -189,7 +189,7 @@ class Selection:
     explained: float = 0.975
     """Fraction of the excess, held out and fitted, that must be gone for effects to be named. benchmarks/blind: on
     148 logs of another engine the right ones left up to 1.3 % (2.3 % where one of two was missed), and what imitated
-    another effect 2.9 % or more."""
+    another effect 2.9 % or more. As much a law must explain of a function of time to come before it."""
     explained_most: float = 5.0
     """Chi2 beyond which more than noise is left, however much is gone. benchmarks/blind: on 142 logs that were
     explained, rightly, up to 4.0 was left, on 98 % of them up to 1.3."""

@@ -33,7 +33,7 @@ def held_out_elsewhere(state: State, rules: Selection) -> Study | None:
     rules : what counts as explained.
     """
     study = state.study
-    at_the_end = all(_is_the_end(held.scored) for held in study.holdout) and len(study.train) == len(study.holdout)
+    at_the_end = all(_is_the_end(held.scored) for held in study.holdout)
     if not at_the_end or not study.procedure.holds_out_anywhere or at_floor(rules, state.fitted):
         return None
     if not shows_late(rules, state.fitted) and not _of_time(state):

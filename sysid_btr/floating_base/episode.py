@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -119,7 +119,7 @@ class FloatingEpisode(Episode):
         return self.base.poses[: len(self.log)]
 
     @classmethod
-    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> FloatingEpisode:
+    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> Self:
         """All of a recording, up to a fall.
 
         Raises
@@ -132,7 +132,7 @@ class FloatingEpisode(Episode):
         return cls(robot, log, np.ones(len(log), dtype=bool), base, segments, None, lengths)
 
     @classmethod
-    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[FloatingEpisode, FloatingEpisode]:
+    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[Self, Self]:
         """A recording whose last fraction before a fall is held out; the fitted part says how long segments are."""
         log, base = reconstruct(robot, log)
         count = len(holdout_split(log, holdout)[0])

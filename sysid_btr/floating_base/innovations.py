@@ -52,7 +52,6 @@ from sysid_btr.floating_base.segments import FloatingReplay
 from sysid_btr.identify.episode import Episode, Procedure
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import NoiseFloor
-from sysid_btr.io.split import holdout_split
 from sysid_btr.models.robot import Robot, servo_joints
 from sysid_btr.objectives.marginal import Projection
 from sysid_btr.objectives.problem import BLOCK, Comparison
@@ -380,13 +379,6 @@ class InnovationsEpisode(Episode):
                 f"innovations need {LEAST}: record more walking"
             )
         return cls(robot, log, np.ones(len(log), dtype=bool), base)
-
-    @classmethod
-    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[Self, Self]:
-        """A recording whose last fraction before a fall is held out, as what is fitted and as what is held out."""
-        both = cls.whole(robot, log, threads)
-        fitted = np.arange(len(both.recording)) < len(holdout_split(both.recording, holdout)[0])
-        return both.scoring(fitted), both.scoring(~fitted)
 
     @property
     def compared(self) -> BoolArray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from sysid_btr.identify.horizon import is_held
 from sysid_btr.identify.numerics import choose_numerics
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import position_noise
-from sysid_btr.io.split import holdout_split
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import to_rotation
 from sysid_btr.objectives.problem import Comparison
@@ -121,17 +120,10 @@ class StandingEpisode(FixedEpisode):
         return StandingProcedure({softness: SOFTER - 1} if feet else {})
 
     @classmethod
-    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> StandingEpisode:
+    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> Self:
         """All of a recording up to a fall."""
         log, base = reconstruct(robot, log)
         return cls(robot, log, np.ones(len(log), dtype=bool), base=base)
-
-    @classmethod
-    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[StandingEpisode, StandingEpisode]:
-        """A recording whose last fraction before a fall is held out, as what is fitted and as what is held out."""
-        log, base = reconstruct(robot, log)
-        fitted = np.arange(len(log)) < len(holdout_split(log, holdout)[0])
-        return cls(robot, log, fitted, base=base), cls(robot, log, ~fitted, base=base)
 
     @staticmethod
     def suits(robot: Robot, log: Log, threads: int = 0) -> bool:

@@ -178,6 +178,21 @@ class Episode(ABC):
     warm_up: ClassVar[float] = 0.0
     """s after its beginning that are not scored."""
 
+    @classmethod
+    @abstractmethod
+    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> Self:
+        """All of a recording."""
+
+    @classmethod
+    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[Self, Self]:
+        """A recording whose last fraction is held out, as what is fitted and as what is held out."""
+        return cls.whole(robot, log, threads).with_end_held_out(holdout)
+
+    def with_end_held_out(self, holdout: float) -> tuple[Self, Self]:
+        """The same with its last fraction held out: what is fitted, and what is held out."""
+        fitted = np.arange(len(self.recording)) < len(holdout_split(self.recording, holdout)[0])
+        return self.scoring(fitted), self.scoring(~fitted)
+
     @property
     def procedure(self) -> Procedure:
         """How a fit goes about it."""
@@ -351,15 +366,8 @@ class FixedEpisode(Episode):
     warm_up: ClassVar[float] = WARM_UP
 
     @classmethod
-    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> FixedEpisode:
-        """All of a recording."""
+    def whole(cls, robot: Robot, log: Log, threads: int = 0) -> Self:
         return cls(robot, log, np.ones(len(log), dtype=bool))
-
-    @classmethod
-    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[FixedEpisode, FixedEpisode]:
-        """A recording whose last fraction is held out, as what is fitted and as what is held out."""
-        fitted = np.arange(len(log)) < len(holdout_split(log, holdout)[0])
-        return cls(robot, log, fitted), cls(robot, log, ~fitted)
 
     def replay(self, terms: Sequence[Term], numerics: Numerics, *, effort: bool = False, threads: int = 0) -> Replay:
         robot = self.robot.for_log(self.log)

@@ -13,7 +13,6 @@ from sysid_btr.errors import LogError, ModelError
 from sysid_btr.identify.episode import Episode, Procedure
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import NoiseFloor, channel_noise
-from sysid_btr.io.split import holdout_split
 from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.problem import Comparison
@@ -103,13 +102,6 @@ class InverseEpisode(Episode):
         own = {j: _sigma(log, f"effort.{j}") * float(np.sqrt(band)) for j in torques}
         bare = cls(robot, recording, scored, motion, own)
         return replace(bare, noise=bare._with_noise_of_motion(log, sigma, own, threads))
-
-    @classmethod
-    def split(cls, robot: Robot, log: Log, holdout: float, threads: int = 0) -> tuple[Self, Self]:
-        """A recording whose last fraction is held out, as what is fitted and as what is held out."""
-        both = cls.whole(robot, log, threads)
-        fitted = np.arange(len(both.recording)) < len(holdout_split(both.recording, holdout)[0])
-        return both.scoring(fitted), both.scoring(~fitted)
 
     @property
     def compared(self) -> BoolArray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from sysid_btr.identify.initial_states import respond, update_initial_states
 from sysid_btr.identify.numerics import choose_numerics, converged, largest_step
 from sysid_btr.identify.smoothing import Tracks, smooth_joints
 from sysid_btr.io.log import Log
-from sysid_btr.io.split import holdout_split
 from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.objectives.marginal import Marginal
@@ -87,7 +86,7 @@ class SegmentedEpisode(Episode):
         return SegmentedProcedure()
 
     @classmethod
-    def whole(cls, robot: Robot, log: Log, threads: int = 0, *, seconds: float | None = None) -> SegmentedEpisode:
+    def whole(cls, robot: Robot, log: Log, threads: int = 0, *, seconds: float | None = None) -> Self:
         """All of a recording, in segments of about so many seconds; None for what `follow` finds.
 
         Raises
@@ -103,7 +102,7 @@ class SegmentedEpisode(Episode):
     @classmethod
     def split(
         cls, robot: Robot, log: Log, holdout: float, threads: int = 0, *, seconds: float | None = None
-    ) -> tuple[SegmentedEpisode, SegmentedEpisode]:
+    ) -> tuple[Self, Self]:
         """A recording whose last fraction is held out, as what is fitted and as what is held out.
 
         Raises
@@ -111,11 +110,9 @@ class SegmentedEpisode(Episode):
         LogError
             If no joint's position is logged, or a part would be too short.
         """
-        fitted = np.arange(len(log)) < len(holdout_split(log, holdout)[0])
-        both = cls.whole(robot, log, threads, seconds=seconds)
-        return both.scoring(fitted), both.scoring(~fitted)
+        return cls.whole(robot, log, threads, seconds=seconds).with_end_held_out(holdout)
 
-    def scoring(self, scored: BoolArray) -> SegmentedEpisode:
+    def scoring(self, scored: BoolArray) -> Self:
         """The same with other samples that count, and with segments that start anew from measured states."""
         cut = _cut(self.recording, self.tracks, self.seconds, scored)
         return replace(self, scored=scored, segments=cut, marginal=None)

@@ -159,7 +159,7 @@ function signals() {
     lines.push(line(`log − ${name}`, of(s.residual[k], factor), data.colours[k], { trace: { yaxis: "y2", showlegend: false } }));
   });
   const rectangle = (more, fillcolor) => ({ type: "rect", layer: "below", line: { width: 0 }, fillcolor, ...more });
-  const held = episode().held_out.length > 1 || episode().held_out[0][0] > time[0] ? episode().held_out : [];
+  const spans = episode().held_out, held = spans.length > 1 || spans[0][0] > time[0] ? spans : [];
   const layout = base(narrow() ? 430 : 520, {
     hovermode: "x", showlegend: true, uirevision: `${state.episode}`,
     legend: { orientation: "h", x: 0, y: 1.01, yanchor: "bottom", bgcolor: "rgba(0,0,0,0)" },

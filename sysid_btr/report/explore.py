@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from sysid_btr._typing import FloatArray
-from sysid_btr.io.split import spans_of
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.report.bodies import Body, bodies_of, filled, placed
 from sysid_btr.report.guide import about_verdict
@@ -66,7 +65,7 @@ def _episode(played: Played, item: PlayedEpisode, stride: int, bodies: tuple[Bod
     return {
         "label": item.label or (log.path.stem if log.path is not None else "the log"),
         "time": packed((log.time - log.time[0])[::stride], "f4"),
-        "held_out": spans_of(log.time, item.episode.scored[: len(log)]),
+        "held_out": item.traces[0].spans,
         "channels": list(dict.fromkeys(trace.channel for trace in item.traces)),
         "sensors": [_sensor(trace, stride) for trace in ordered],
         "scene": _scene(item, bodies, frames) if bodies else None,
