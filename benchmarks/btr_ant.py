@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.btr_seeds import loop, study
-from sysid_btr.btr.controllers import Controller, ant_gait
+from sysid_btr.btr.controllers import Controller
+from sysid_btr.btr.gaits import ant_gait
 from sysid_btr.btr.outcome import BackToReality, estimate_model
 from sysid_btr.btr.problems import ControllerProblem, Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise

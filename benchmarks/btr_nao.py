@@ -26,7 +26,8 @@ import numpy as np
 from benchmarks.btr_seeds import loop, study
 from benchmarks.paper_nao import V32
 from sysid_btr.btr.choice import pool_of
-from sysid_btr.btr.controllers import Controller, NaoGait
+from sysid_btr.btr.controllers import Controller
+from sysid_btr.btr.gaits import NaoGait
 from sysid_btr.btr.learning import model_fit
 from sysid_btr.btr.outcome import BackToReality
 from sysid_btr.btr.problems import ControllerProblem, Stage

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.ground import commands_of, draw
 from reference_simulator.legged import DrakeRobot, Ground, Truth
-from sysid_btr.btr.controllers import NaoGait
+from sysid_btr.btr.gaits import NaoGait
 from sysid_btr.btr.robot import Noise, recorded
 from sysid_btr.btr.task import Walk
 from sysid_btr.diagnosis.close import close
@@ -118,9 +118,9 @@ def walker(number: int) -> Walker:
         )
         moves = draw(int(rng.integers(1 << 30)))
         commands = commands_of(replace(moves, arms=0.5 * moves.arms), TASK.time, joints)
-        motion = DrakeRobot(NAO, TASK, NaoGait(), truth, step=STEP).play(commands)
-        if not TASK.fallen(motion.base[None]).any():
-            log = recorded(motion, TASK, joints, Noise(), rng, "nao").log
+        played = DrakeRobot(NAO, TASK, NaoGait(), truth, step=STEP).play(commands)
+        if not TASK.fallen(played.motion).any():
+            log = recorded(played, TASK, joints, Noise(), rng, "nao").log
             assert log is not None
             return Walker(missing, truth, log)
     raise RuntimeError(f"walk {number}: {TRIES} robots fell")

@@ -45,6 +45,7 @@ TITLES = {
     "reports": "The reports",
     "notebooks": "Notebooks",
     "effects": "Effects",
+    "back_to_reality": "A controller that works on the robot",
     "servos": "Identified servos",
     "result": "result.json",
     "machines": "Many machines",

@@ -32,8 +32,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.controllers import Controller, ControllerSpace
-from sysid_btr.btr.robot import Motion, Noise, Trial, noise_of, recorded
-from sysid_btr.btr.task import Walk
+from sysid_btr.btr.robot import Noise, Played, Trial, noise_of, recorded
+from sysid_btr.btr.task import Motion, Walk
 from sysid_btr.btr.world import feet_geoms
 from sysid_btr.models.robot import Robot
 from sysid_btr.mujoco_conventions import free_joints
@@ -112,7 +112,7 @@ class DrakeRobot:
         rng = noise_of(self.seed, controller)
         return recorded(self.play(commands), self.task, self.space.joints, self.noise, rng, self.model.name)
 
-    def play(self, commands: FloatArray) -> Motion:
+    def play(self, commands: FloatArray) -> Played:
         """What happens while commands (n, j) of the space's joints are played."""
         return self._machine.play(commands)
 
@@ -221,7 +221,7 @@ class _Machine:
                 points[found] = _sensor(model, body, place)
         return points
 
-    def play(self, commands: FloatArray) -> Motion:
+    def play(self, commands: FloatArray) -> Played:
         robot, plant = self.robot, self.plant
         task, friction = robot.task, np.array([robot.truth.friction.get(j, 0.0) for j in self.joints])
         simulator = Simulator(self.diagram)
@@ -255,7 +255,7 @@ class _Machine:
                 self._read(context, base[i], {name: values[i] for name, values in sensors.items()})
                 position[i] = plant.GetPositions(context)[angles]
             simulator.AdvanceTo((tick + 1) * robot.step)
-        return Motion(base, position, commands, sensors)
+        return Played(Motion(self.joints, position[None], base[None]), commands, sensors)
 
     def _stand(self, context: Any) -> None:
         """Put the base so that the lowest point touches the floor."""

@@ -28,6 +28,20 @@ def free_joints(model: mujoco.MjModel) -> IntArray:
     return np.flatnonzero(model.jnt_type == FREE)
 
 
+def place_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of bodies, but for the world, and of sites."""
+    bodies = (model.body(i).name for i in range(1, model.nbody))
+    return tuple(name for name in (*bodies, *(model.site(i).name for i in range(model.nsite))) if name)
+
+
+def find_place(model: mujoco.MjModel, name: str) -> tuple[str, int]:
+    """Field of mjData with the places of its kind, and its row, of a site or else a body."""
+    import mujoco
+
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
+    return ("site_xpos", site) if site >= 0 else ("xpos", model.body(name).id)
+
+
 def to_rotation(quaternion: FloatArray) -> Rotation:
     """Rotations of quaternions (..., 4), scalar first."""
     from scipy.spatial.transform import Rotation

@@ -15,16 +15,17 @@ import pytest
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.choice import Choice, Offer, Pool, disagreement, fittest, pool_of
 from sysid_btr.btr.closing import Joined
-from sysid_btr.btr.controllers import Controller, NaoGait, SineGait, ant_gait
+from sysid_btr.btr.controllers import Controller
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import FolderExchange
+from sysid_btr.btr.gaits import NaoGait, SineGait, ant_gait
 from sysid_btr.btr.learning import Learnt, model_fit
 from sysid_btr.btr.loop import back_to_reality, disengaged
 from sysid_btr.btr.outcome import BackToReality, Iteration, estimate_model
 from sysid_btr.btr.problems import ControllerProblem, ModelProblem, Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise, Robot, Trial
 from sysid_btr.btr.settings import Settings
-from sysid_btr.btr.task import Walk
+from sysid_btr.btr.task import Motion, Walk
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.world import make_world
 from sysid_btr.cli import run
@@ -126,11 +127,12 @@ def test_the_ant_has_six_legs_eighteen_servos_and_stands() -> None:
     world = make_world(MODEL, TASK, threads=1)
     still = np.zeros((1, len(SPACE.names)))
     ((_, outputs),) = world.run(world.spread(SPACE.joints, SPACE.commands(still, TASK.time)), np.zeros((1, 0)))
-    assert outputs.base is not None
-    height = outputs.base[0, :, 2]
+    motion = world.motion(outputs, np.zeros((1, 0)))
+    assert motion.base is not None
+    height = motion.base[0, :, 2]
     assert abs(height[-1] - height[0]) < 0.01
-    assert not TASK.fallen(outputs.base).any()
-    assert abs(TASK.fitness(outputs.base)[0]) < 0.01
+    assert not TASK.fallen(motion).any()
+    assert abs(TASK.fitness(motion)[0]) < 0.01
 
 
 def test_a_length_written_into_fields_is_the_model_that_a_compiler_makes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,8 +200,9 @@ def test_fitness_is_the_speed_up_to_the_fall() -> None:
     base[:, :, 3] = 1.0
     over = TASK.time >= 0.5
     base[1, over, 3:5] = [np.cos(np.pi / 4), np.sin(np.pi / 4)]
-    np.testing.assert_allclose(TASK.fitness(base), [0.4, 0.2], atol=0.01)
-    assert TASK.fallen(base)[1].sum() == over.sum()
+    motion = Motion((), np.zeros((2, len(TASK.time), 0)), base)
+    np.testing.assert_allclose(TASK.fitness(motion), [0.4, 0.2], atol=0.01)
+    assert TASK.fallen(motion)[1].sum() == over.sum()
 
 
 def test_runs_do_not_depend_on_what_else_is_in_the_batch() -> None:
@@ -784,4 +787,4 @@ def test_the_verb_refuses_what_it_does_not_have(capsys: pytest.CaptureFixture[st
     assert run([*COMMAND, "--exchange", str(tmp_path)]) == 2
     emps = ["emps" if a == "ant" else a for a in COMMAND]
     assert run(emps) == 2
-    assert "no built-in controllers" in capsys.readouterr().err
+    assert "a robot that walks has one, at its base" in capsys.readouterr().err

@@ -13,7 +13,8 @@ from scipy.stats import chi2
 from sysid_btr.btr import learning
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.closing import join_effects
-from sysid_btr.btr.controllers import Controller, NaoGait
+from sysid_btr.btr.controllers import Controller
+from sysid_btr.btr.gaits import NaoGait
 from sysid_btr.btr.learning import Learnt, learn, learnt_once, model_fit, trial_study, usable_logs
 from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.robot import HiddenRobot, Noise, Trial

@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("pydrake", reason="needs drake: pip install 'sysid-btr[benchmarks]'")
 
 from reference_simulator.legged import DrakeRobot, Truth
-from sysid_btr.btr.controllers import Controller, NaoGait, SineGait
+from sysid_btr.btr.controllers import Controller
+from sysid_btr.btr.gaits import NaoGait, SineGait
 from sysid_btr.btr.robot import SILENT, HiddenRobot
 from sysid_btr.btr.task import Walk
 from sysid_btr.btr.world import make_world

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from reference_simulator.legged import Ground, Truth
-from sysid_btr.btr.controllers import NaoGait
+from sysid_btr.btr.gaits import NaoGait
 from sysid_btr.btr.task import Walk
 from sysid_btr.models.builtin import load_robot
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.models.robot import Robot, servo_drives
+from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.effect import GROUND
 from sysid_btr.terms.library import select_effects
@@ -77,6 +78,7 @@ class Belief:
         ground : whether the ground is asked for, too.
         """
         there = {term.name for term in terms}
+        ground = ground and len(free_joints(robot.model)) > 0
         found: list[Term] = []
         for effect in select_effects([name for name in UNMEASURED if name not in there] or ["all"]):
             places = robot.names(effect.scope)

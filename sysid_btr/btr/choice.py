@@ -63,7 +63,7 @@ class Offer:
     rivals : gives the fitness (k, m) of controllers (m, p) in k candidate models.
     foresight : of the pool, given all trials so far; None where there is one model only.
     near : (n,) whether a controller is near enough to what has worked.
-    best : largest fitness of a trial that stood, m/s; zero before, for a robot that stands still.
+    best : largest fitness of a trial that stood; zero before, for a robot that stays as it is.
     """
 
     pool: Pool

@@ -14,14 +14,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.controllers import Controller, ControllerSpace
 from sysid_btr.btr.robot import OUTCOMES, Trial
-from sysid_btr.btr.task import Walk
+from sysid_btr.btr.task import Task
 from sysid_btr.errors import InterruptedRun, LogError, UsageError
 from sysid_btr.io._text import some
 from sysid_btr.io.log import MOTION, Log, LogMeta
@@ -40,8 +40,6 @@ REQUEST, COMMAND, RECORDED, REPLY, PROBLEMS = (
     "outcome.json",
     "problems.txt",
 )
-FASTEST = 100.0
-"""m/s, beyond which a fitness is a mistake: three times as fast as any animal runs."""
 APART, LATE = 0.01, 0.5
 """rad (m), and fraction of a command's standard deviation, by which what was played may differ from what was asked for:
 a recorder notes a command some samples late, and another motion of the same size is 1.4 deviations away."""
@@ -61,19 +59,20 @@ class FolderExchange:
     ----------
     folder : of the exchange; created if missing.
     task, space : what is asked for.
-    robot : name of the robot, for the log.
+    robot, mount : name of the robot, and whether its base is free or fixed, for the log.
     poll : s between looks for a reply.
     patience : s after which `InterruptedRun` is raised; None waits for ever.
     say : called with what is waited for.
     """
 
     folder: Path
-    task: Walk
+    task: Task
     space: ControllerSpace
     robot: str = ""
     poll: float = 1.0
     patience: float | None = None
     say: Callable[[str], None] = quiet
+    mount: Literal["fixed", "free"] = "free"
 
     def run(self, controller: Controller) -> Trial:
         """Ask for a trial, unless it was asked for before, and wait for what came of it.
@@ -119,7 +118,7 @@ class FolderExchange:
             "robot": self.robot,
             "duration": self.task.duration,
             "sample_period": self.task.period,
-            "fitness": "mean forward speed, m/s",
+            "fitness": _fitness(self.task),
             "parameters": dict(zip(self.space.names, map(float, controller.values), strict=True)),
         }
         if request.exists():
@@ -145,7 +144,7 @@ class FolderExchange:
         return Log(
             time=self.task.time,
             channels={f"command.{joint}": commands[:, i] for i, joint in enumerate(self.space.joints)},
-            meta=LogMeta(robot=self.robot, mount="free", sample_period=self.task.period, source=MOTION),
+            meta=LogMeta(robot=self.robot, mount=self.mount, sample_period=self.task.period, source=MOTION),
             episode=np.zeros(len(self.task.time), dtype=np.int64),
         )
 
@@ -156,14 +155,16 @@ class FolderExchange:
         except (OSError, ValueError) as error:
             return None, [f"{REPLY}: not JSON ({error})"]
         if not isinstance(content, dict) or content.get("outcome") not in OUTCOMES:
-            return None, [f'{REPLY}: expected {{"outcome": one of {", ".join(OUTCOMES)}, "fitness": m/s}}']
+            return None, [
+                f'{REPLY}: expected {{"outcome": one of {", ".join(OUTCOMES)}, "fitness": {_fitness(self.task)}}}'
+            ]
         outcome = content["outcome"]
         fitness: Any = content.get("fitness", 0.0 if outcome == "crashed" else None)
-        problems = []
-        if isinstance(fitness, bool) or not isinstance(fitness, int | float) or not abs(fitness) <= FASTEST:
-            problems.append(
-                f"{REPLY}: fitness is {fitness!r}; expected the mean forward speed in m/s, {FASTEST:g} at most"
-            )
+        problems, (least, most) = [], self.task.plausible
+        number = isinstance(fitness, int | float) and not isinstance(fitness, bool) and np.isfinite(fitness)
+        if not number or not least <= fitness <= most:
+            ends = f", {most:g} at most" if np.isfinite(most) else ""
+            problems.append(f"{REPLY}: fitness is {fitness!r}; expected the {_fitness(self.task)}{ends}")
         log: Log | None = None
         if (place / RECORDED).exists() or outcome != "crashed":
             log, wrong = self._log(place / RECORDED, outcome)
@@ -202,6 +203,11 @@ class FolderExchange:
             if np.sqrt(np.nanmean(difference**2)) > APART + LATE * np.std(own):
                 wrong.append(joint)
         return [f"{RECORDED}: its commands of {some(wrong)} are not those of {COMMAND}"] if wrong else []
+
+
+def _fitness(task: Task) -> str:
+    """What a task's fitness is, with its unit."""
+    return task.goal + ("" if task.unit == "1" else f", {task.unit}")
 
 
 def _stamps(*paths: Path) -> tuple[float, ...]:

@@ -9,7 +9,7 @@ al. 2015, doi:10.1038/nature14422, has the discrepancy alone). Whether it stands
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -74,9 +74,9 @@ class Foreseen:
 
     Attributes
     ----------
-    fitness, std : m/s, if it stands.
+    fitness, std : if it stands, in the task's unit.
     stands : probability.
-    low, high : m/s, 90 % interval, falls included.
+    low, high : 90 % interval, falls included.
     """
 
     fitness: float
@@ -85,6 +85,10 @@ class Foreseen:
     low: float
     high: float
 
+    def within(self, least: float, most: float) -> Foreseen:
+        """The same where no fitness is below or above some."""
+        return replace(self, low=max(self.low, least), high=min(self.high, most))
+
 
 @dataclass(frozen=True, eq=False)
 class Foresight:
@@ -92,7 +96,7 @@ class Foresight:
 
     Attributes
     ----------
-    mean, std : (n,) fitness of those that stand, m/s.
+    mean, std : (n,) fitness of those that stand, in the task's unit.
     stands : (n,) probability.
     """
 
@@ -101,7 +105,7 @@ class Foresight:
     stands: FloatArray
 
     def improvement(self, best: float) -> FloatArray:
-        """Expected gain over the best so far, times the chance to stand, (n,) m/s (Jones et al. 1998)."""
+        """Expected gain over the best so far, times the chance to stand, (n,) (Jones et al. 1998)."""
         from scipy.stats import norm
 
         z = (self.mean - best) / self.std

@@ -75,14 +75,15 @@ def usable_logs(trials: Sequence[Trial], most: int = LOGS) -> list[Log]:
 
 
 def trial_study(robot: Robot, logs: Sequence[Log], held_out: Sequence[Log] = (), threads: int = 0) -> Study:
-    """Trials to be fitted, and others to judge by, compared by innovations.
+    """Trials to be fitted, and others to judge by; of a robot on the ground compared by innovations.
 
     Raises
     ------
     UsageError, LogError, ModelError
         If they cannot be.
     """
-    return make_study(robot, logs, holdout=held_out, channels=("position",), mode=Mode("innovations"), threads=threads)
+    mode = Mode("innovations" if any(log.meta.mount == "free" for log in logs) else "auto")
+    return make_study(robot, logs, holdout=held_out, channels=("position",), mode=mode, threads=threads)
 
 
 def learn(

@@ -20,7 +20,7 @@ from sysid_btr._typing import FloatArray, IntArray
 from sysid_btr.btr.belief import Belief
 from sysid_btr.btr.choice import Offer, Pool, get_choice, pool_of
 from sysid_btr.btr.closing import EXPLAINED, Joined, join_effects
-from sysid_btr.btr.controllers import ControllerSpace
+from sysid_btr.btr.controllers import ControllerSpace, check_space
 from sysid_btr.btr.correction import linear_correction
 from sysid_btr.btr.exchange import quiet
 from sysid_btr.btr.foresight import Foreseen
@@ -31,7 +31,7 @@ from sysid_btr.btr.problems import FITNESS, ControllerProblem, ModelProblem, Sea
 from sysid_btr.btr.robot import Robot
 from sysid_btr.btr.robust import RobustProblem
 from sysid_btr.btr.settings import Settings
-from sysid_btr.btr.task import Walk
+from sysid_btr.btr.task import Task
 from sysid_btr.btr.trials import TrialBook, Tried
 from sysid_btr.btr.trust import Region
 from sysid_btr.btr.world import make_world
@@ -70,7 +70,7 @@ def back_to_reality(
     robot: Robot,
     space: ControllerSpace,
     *,
-    task: Walk,
+    task: Task,
     settings: Settings | None = None,
     seed: int = 0,
     folder: Path | None = None,
@@ -98,10 +98,11 @@ def back_to_reality(
     InterruptedRun
         If the user stopped a search; what was done is kept.
     UsageError
-        If the folder holds another run's work.
+        If the folder holds another run's work, or the model cannot do the task or play the controllers.
     """
     if not terms:
         raise UsageError("no parameter is declared: name what the trials may correct (--fit)")
+    check_space(space, model, task.time)
     settings = Settings() if settings is None else settings
     loop = _Loop(model, robot, space, task, settings, seed, folder, threads, progress, say, tuple(terms), fingerprint)
     return loop.go()
@@ -114,7 +115,7 @@ class _Loop:
     model: RobotModel
     robot: Robot
     space: ControllerSpace
-    task: Walk
+    task: Task
     settings: Settings
     seed: int
     folder: Path | None
@@ -144,25 +145,33 @@ class _Loop:
         settings = replace(self.settings, iterations=1, requirement=None, worthwhile=None)
         parameters = [(p.name, p.nominal, p.lower, p.upper) for p in self.stage.parameters]
         bounds = [self.space.lower.tolist(), self.space.upper.tolist(), self.space.start.tolist()]
-        content = [__version__, self.model.fingerprint, parameters, bounds, repr(self.task), repr(settings), self.seed]
+        content = [
+            __version__,
+            self.model.fingerprint,
+            parameters,
+            bounds,
+            self.task.fingerprint,
+            repr(settings),
+            self.seed,
+        ]
         content.append(self.fingerprint)
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def go(self) -> BackToReality:
-        began = perf_counter()
+        began, told = perf_counter(), self.task.in_words
         reason, finished = "", True
         for number in range(1, self.settings.iterations + 1):
             self.progress(done=0, total=None, best=np.inf, note=f"iteration {number}")
             with phase("", 1 / (self.settings.iterations - number + 1)):
                 self.rounds.append(self._round(number))
-            self.say(_line(self.rounds[-1]))
+            self.say(_line(self.rounds[-1], self.task))
             best = self.rounds[-1].best
             if self.settings.requirement is not None and best >= self.settings.requirement:
-                reason = f"The requirement is met: {best:.4g} m/s on the robot after {len(self.book.made)} trials."
+                reason = f"The requirement is met: {told(best)} on the robot after {len(self.book.made)} trials."
                 break
             promise = self.rounds[-1].promise
-            if self._not_worthwhile(promise):
-                reason = f"Another trial is worth {promise:.2g} m/s, less than {self.settings.worthwhile:.2g}."
+            if promise is not None and self._not_worthwhile(promise):
+                reason = f"Another trial is worth {told(promise, 2)}, less than {self.settings.worthwhile:.2g}."
                 break
             away = disengaged(self.rounds)
             if away:
@@ -268,7 +277,7 @@ class _Loop:
         models = np.vstack([belief.mean, belief.draws(rng, MANY * self.settings.draws - 1)])
         if self.cloud is None or not np.array_equal(models, self.cloud.drawn.models):
             self.cloud = Cloud(Imagination(self._stage((*self.terms, *others)), models))
-            self.say(_believed(self.cloud.drawn, self.settings))
+            self.say(_believed(self.cloud.drawn, self.settings, self.task))
         self.simulations += self.cloud.learn(self.book.made, self._journal(number, "models_drawn"))
         rng = np.random.default_rng([self.seed, number, STEPS["models_drawn"]])
         self.picked = self.cloud.pick(ASSESSED * self.settings.draws, rng)
@@ -289,7 +298,7 @@ class _Loop:
         return self._search(number, "controllers", estimator, problem)
 
     def _try(self, number: int, pool: Pool, drawn: Imagination | None) -> float | None:
-        """Step 2: try controllers, each chosen by all that was tried before; what the first promised, m/s."""
+        """Step 2: try controllers, each chosen by all that was tried before; what the first promised, as fitness."""
         choose, count = get_choice(self.settings.choice), self.settings.trials
         disagreeing: dict[bytes, FloatArray] = {}
 
@@ -318,11 +327,11 @@ class _Loop:
                 if self._not_worthwhile(promise):
                     break
             taken.append(row)
-            foreseen = None if foresight is None else foresight.of(row)
+            foreseen = None if foresight is None else foresight.of(row).within(*self.task.plausible)
             expected = float(pool.expected[row]) if foreseen is None else foreseen.fitness
             tried = self.book.add(self.robot, number, pool.controllers[row], expected, foreseen)
             if foreseen is not None:
-                self.say(_told(tried, foreseen))
+                self.say(_told(tried, foreseen, self.task))
         return promise
 
     def _not_worthwhile(self, promise: float | None) -> bool:
@@ -338,7 +347,7 @@ class _Loop:
         if self.cloud.done is not None:
             found = self.cloud.done.models(self.picked).beside(found)
         controllers = np.reshape([*before, *pool.controllers], (-1, len(self.space.names)))
-        return Outlook(controllers, found, np.arange(len(before), len(controllers)))
+        return Outlook(controllers, found, np.arange(len(before), len(controllers)), self.task.falls)
 
     def _untie(self) -> tuple[str, ...]:
         """Leave out ties of the model that the trials contradict, in all that comes; a remark on each."""
@@ -520,35 +529,37 @@ def _mean(values: FloatArray | list[float]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
 
-def _believed(drawn: Imagination, settings: Settings) -> str:
+def _believed(drawn: Imagination, settings: Settings, task: Task) -> str:
     called = dict.fromkeys(p.name.partition(":")[0].partition(".")[0] for p in drawn.stage.parameters)
     risk = settings.risk
+    fall = f", and a fall as {task.in_words(-risk.fall)}" if task.falls else ""
     return (
-        f"gaits are searched for in {settings.draws} of {len(drawn.models)} models that differ in {', '.join(called)}; "
-        f"what counts is their mean speed, by {100 * risk.weight:.0f} % that in the worst {100 * risk.share:.0f} %, "
-        f"and a fall as -{risk.fall:g} m/s"
+        f"controllers are searched for in {settings.draws} of {len(drawn.models)} models that differ in "
+        f"{', '.join(called)}; what counts is the mean fitness in them ({task.goal}), by {100 * risk.weight:.0f} % that "
+        f"in the worst {100 * risk.share:.0f} %{fall}"
     )
 
 
-def _told(t: Tried, foreseen: Foreseen) -> str:
-    ended = {"done": "stood", "fallen": "fell", "crashed": "crashed"}[t.trial.outcome]
+def _told(t: Tried, foreseen: Foreseen, task: Task) -> str:
+    falls = f"; falls with {probability(1 - foreseen.stands)}" if task.falls else ""
+    ended = {"done": ", stood" if task.falls else "", "fallen": ", fell", "crashed": ", crashed"}[t.trial.outcome]
     return (
-        f"trial {t.controller.label}: foreseen {foreseen.fitness:.3g} m/s ({foreseen.low:.2g} to {foreseen.high:.2g}; "
-        f"falls with {probability(1 - foreseen.stands)}); {t.trial.fitness:.3g} m/s, {ended}"
+        f"trial {t.controller.label}: foreseen {task.in_words(foreseen.fitness, 3)} ({foreseen.low:.2g} to "
+        f"{foreseen.high:.2g}{falls}); {task.in_words(t.trial.fitness, 3)}{ended}"
     )
 
 
-def _line(r: Iteration) -> str:
+def _line(r: Iteration, task: Task) -> str:
     fell = sum(t.trial.outcome != "done" for t in r.tried)
     model = "after correction of the model" if r.corrected else "in the model as it is"
     parts = [
         f"iteration {r.number}: {len(r.tried)} trials" + (f" ({fell} fell or crashed)" if fell else ""),
-        f"best on the robot {r.best:.4g} m/s",
+        f"best on the robot {task.in_words(r.best)}",
         f"expected {r.expected:.4g}",
         f"fitness differs by {r.transfer:.2g} from what was foreseen, by {r.delta:.2g} {model}",
     ]
     if r.promise is not None:
-        parts.append(f"a trial promised {r.promise:.2g} m/s")
+        parts.append(f"a trial promised {task.in_words(r.promise, 2)}")
     return "; ".join(
         [", ".join(parts), *r.untied, *([r.joined] if r.joined else []), *([] if r.learnt is None else [str(r.learnt)])]
     )

@@ -46,8 +46,8 @@ class Iteration:
     noise : position error of this model in noise floors on them; NaN where nothing was logged.
     best : largest real fitness so far of a trial that stood; of any where none did.
     joined : what `close` said, if it ran.
-    promise : what the first trial was worth beforehand, m/s: the gain to be expected, times the chance to stand; None
-        where one model chose. Nothing is tried where that is less than is worthwhile.
+    promise : what the first trial was worth beforehand: the gain in fitness to be expected, times the chance to stand;
+        None where one model chose. Nothing is tried where that is less than is worthwhile.
     untied : a remark on each tie of joints that the trials so far contradict, and that is left out of the model.
     learnt : what Step 3 learnt by a likelihood, if that was asked for.
     """
@@ -164,7 +164,8 @@ class BackToReality:
                 "intervals": "linearised fitness of the newest trials, widened by the remaining step to the optimum"
                 if self.belief is None
                 else "what was believed beforehand and the likelihood of the trials' logs, linearised",
-                "units": {"fitness": "m/s"},
+                "units": {"fitness": stage.task.unit},
+                "task": {"fitness": stage.task.goal, "duration": stage.task.duration},
                 "numerics": {
                     "integrator": world.numerics.integrator,
                     "timestep": world.numerics.timestep,
@@ -252,30 +253,29 @@ def _score(predicted: FloatArray, real: FloatArray) -> dict[str, Any]:
 
 
 def _message(outcome: BackToReality) -> str:
-    best, first = outcome.best, outcome.iterations[0]
+    best, first, told = outcome.best, outcome.iterations[0], outcome.stage.task.in_words
     fell = sum(t.trial.outcome != "done" for t in outcome.tried)
     started = max((t.trial.fitness for t in first.tried), default=float("nan"))
     return (
-        f"{best.trial.fitness:.4g} m/s on the robot (trial {best.controller.label}; {started:.4g} in the first "
+        f"{told(best.trial.fitness)} on the robot (trial {best.controller.label}; {started:.4g} in the first "
         f"iteration) after {len(outcome.tried)} trials{f', {fell} of which fell or crashed' if fell else ''}; the "
-        f"model predicts fitness within {outcome.iterations[-1].transfer:.2g} m/s, {first.transfer:.2g} at first. "
+        f"model predicts fitness within {told(outcome.iterations[-1].transfer, 2)}, {first.transfer:.2g} at first. "
         f"{_foreseen(outcome)}{_untied(outcome)}{outcome.reason}"
     )
 
 
 def _foreseen(outcome: BackToReality) -> str:
     """How what was foreseen came out, in words."""
+    task = outcome.stage.task
     told = [(t, t.foreseen) for t in outcome.tried if t.foreseen is not None]
     if not told:
         return ""
     held = sum(f.low <= t.trial.fitness <= f.high for t, f in told)
     falls, fell = sum(1 - f.stands for _, f in told), sum(t.trial.outcome != "done" for t, _ in told)
     last = outcome.iterations[-1].promise
-    worth = "" if last is None else f" The last iteration's trials promised {last:.2g} m/s."
-    return (
-        f"Of {len(told)} trials {held} lay in their 90 % interval; {falls:.1f} falls were foreseen, {fell} happened."
-        f"{worth} "
-    )
+    worth = "" if last is None else f" The last iteration's trials promised {task.in_words(last, 2)}."
+    counted = f"; {falls:.1f} falls were foreseen, {fell} happened" if task.falls else ""
+    return f"Of {len(told)} trials {held} lay in their 90 % interval{counted}.{worth} "
 
 
 def _untied(outcome: BackToReality) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -143,11 +143,13 @@ class Outlook:
     controllers : (n, p) of both.
     drawn : what they do.
     asked : (m,) rows of those that may be tried next.
+    falls : whether a trial can fail.
     """
 
     controllers: FloatArray
     drawn: Drawn
     asked: IntArray
+    falls: bool = True
 
     def foresee(self, made: Sequence[Tried]) -> Foresight:
         """What is foreseen of the next ones, given trials; those of other controllers are passed over."""
@@ -156,4 +158,5 @@ class Outlook:
         real = np.array([t.trial.fitness for _, t in known], dtype=np.float64)
         stood = np.array([t.trial.outcome == "done" for _, t in known], dtype=bool)
         seen = np.array([i for i, _ in known], dtype=np.int64)
-        return foresee(self.drawn.of(self.asked), self.drawn.of(seen), real, stood)
+        found = foresee(self.drawn.of(self.asked), self.drawn.of(seen), real, stood)
+        return found if self.falls else replace(found, stands=np.ones(len(found.stands)))

@@ -12,8 +12,9 @@ import numpy as np
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.robot import Trial
-from sysid_btr.btr.task import Walk
+from sysid_btr.btr.task import Motion, Task
 from sysid_btr.btr.world import World
+from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Problem
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.distance import Distance, get_distance, phi1
@@ -35,7 +36,7 @@ class Stage:
     """
 
     world: World
-    task: Walk
+    task: Task
     space: ControllerSpace
 
     @property
@@ -60,11 +61,29 @@ class Stage:
         which, model = np.tile(np.arange(m), k), np.repeat(np.arange(k), m)
         fitness, fell = np.empty(k * m), np.empty(k * m, dtype=bool)
         for rows in _blocks(k * m):
-            for part, outputs in self.world.run(commands[which[rows]], models[model[rows]]):
-                assert outputs.base is not None
-                fitness[rows][part] = self.task.fitness(outputs.base)
-                fell[rows][part] = self.task.fallen(outputs.base)[:, -1]
+            values = models[model[rows]]
+            for part, outputs in self.world.run(commands[which[rows]], values):
+                motion = self.world.motion(outputs, values[part], self.task.watched)
+                fitness[rows][part] = judged(self.task, motion)
+                fell[rows][part] = self.task.fallen(motion)[:, -1]
         return fitness.reshape(k, m), fell.reshape(k, m) | np.isnan(fitness).reshape(k, m)
+
+
+def judged(task: Task, motion: Motion) -> FloatArray:
+    """Fitness (m,) of motions; NaN where a simulation diverged, whatever the task makes of that.
+
+    Raises
+    ------
+    UsageError
+        If a task's fitness is not one number for each motion.
+    """
+    found = np.asarray(task.fitness(motion), dtype=np.float64)
+    if found.shape != (len(motion.position),):
+        raise UsageError(
+            f"task {type(task).__name__}: its fitness of {len(motion.position)} motions has the shape {found.shape}; "
+            f"one number for each motion is wanted, ({len(motion.position)},)"
+        )
+    return np.where(np.isfinite(motion.position).all(axis=(1, 2)), found, np.nan)
 
 
 def _blocks(count: int, size: int = 256) -> list[slice]:

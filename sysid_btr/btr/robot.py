@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.controllers import Controller, ControllerSpace
-from sysid_btr.btr.task import Walk
+from sysid_btr.btr.task import Motion, Task
 from sysid_btr.btr.world import World
 from sysid_btr.io.log import Log, LogMeta
 
@@ -44,7 +44,7 @@ class Robot(Protocol):
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of a hidden robot's sensors: encoders rad, and step of these; the base's speed m/s."""
+    """Standard deviations of a hidden robot's sensors: encoders rad, and step of these; fitness."""
 
     encoder: float = 4e-4
     step: float = 2 * np.pi / 4096
@@ -71,7 +71,7 @@ class HiddenRobot:
 
     world: World
     truth: FloatArray
-    task: Walk
+    task: Task
     space: ControllerSpace
     noise: Noise = SILENT
     seed: int = 0
@@ -81,28 +81,26 @@ class HiddenRobot:
         world, joints = self.world, self.space.joints
         commands = world.spread(joints, self.space.commands(controller.values[None], self.task.time))
         (_, outputs), *_ = world.run(commands, self.truth[None])
-        assert outputs.base is not None
-        if not np.isfinite(outputs.base).all():
+        if not np.isfinite(outputs.position).all():
             return Trial(None, 0.0, "crashed")
         used = [world.index.joints.index(j) for j in joints]
-        sensors = world.sensors(outputs, commands[0], self.truth)
-        moved = Motion(outputs.base[0], outputs.position[0][:, used], commands[0][:, used], sensors)
-        return recorded(moved, self.task, joints, self.noise, noise_of(self.seed, controller), world.robot.name)
+        motion = world.motion(outputs, self.truth[None], self.task.watched)
+        played = Played(motion, commands[0][:, used], world.sensors(outputs, commands[0], self.truth))
+        return recorded(played, self.task, joints, self.noise, noise_of(self.seed, controller), world.robot.name)
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class Played:
     """What a simulated robot did in a trial, at the task's samples.
 
     Attributes
     ----------
-    base : (n, 13) as in `Outputs.base`.
-    position, command : (n, j) of the joints that are commanded.
+    motion : of one robot, the joints that are commanded among those that it has.
+    command : (n, j) of the joints that are commanded.
     sensors : the model's by name, (n, size) each.
     """
 
-    base: FloatArray
-    position: FloatArray
+    motion: Motion
     command: FloatArray
     sensors: Mapping[str, FloatArray]
 
@@ -113,44 +111,46 @@ def noise_of(seed: int, controller: Controller) -> np.random.Generator:
 
 
 def recorded(
-    motion: Motion, task: Walk, joints: Sequence[str], noise: Noise, rng: np.random.Generator, robot: str
+    played: Played, task: Task, joints: Sequence[str], noise: Noise, rng: np.random.Generator, robot: str
 ) -> Trial:
     """The trial as its noisy sensors tell it; after a fall nothing is recorded.
 
     Parameters
     ----------
-    motion : what happened.
+    played : what happened.
     task : which.
     joints : that are commanded, (j,).
     noise, rng : of the sensors.
     robot : its name, for the log.
     """
-    base = motion.base[None]
-    down = task.fallen(base)[0]
-    log = _log(motion, task, joints, noise, rng, robot)
-    fitness = float(task.fitness(base)[0]) + noise.fitness * rng.normal()
+    down = task.fallen(played.motion)[0]
+    log = _log(played, task, joints, noise, rng, robot)
+    fitness = float(task.fitness(played.motion)[0]) + noise.fitness * rng.normal()
     if down.any():
         # what lies on the ground is hardly informative: the recording stops there
         return Trial(log.window(0, max(int(np.argmax(down)), 2)), fitness, "fallen")
     return Trial(log, fitness, "done")
 
 
-def _log(motion: Motion, task: Walk, joints: Sequence[str], noise: Noise, rng: np.random.Generator, robot: str) -> Log:
-    n, sensors = len(motion.base), motion.sensors
-    seen = motion.position + noise.encoder * rng.normal(size=motion.position.shape)
+def _log(played: Played, task: Task, joints: Sequence[str], noise: Noise, rng: np.random.Generator, robot: str) -> Log:
+    motion, sensors = played.motion, played.sensors
+    seen = motion.position[0][:, [motion.joints.index(joint) for joint in joints]]
+    n, seen = len(seen), seen + noise.encoder * rng.normal(size=seen.shape)
     if noise.step > 0:
         seen = np.round(seen / noise.step) * noise.step
-    channels = {f"command.{joint}": motion.command[:, i] for i, joint in enumerate(joints)}
+    channels = {f"command.{joint}": played.command[:, i] for i, joint in enumerate(joints)}
     channels |= {f"position.{joint}": seen[:, i] for i, joint in enumerate(joints)}
-    for name, sigma in (("gyro", noise.gyro), ("acc", noise.acc)):
-        if name in sensors:
-            values = sensors[name] + sigma * rng.normal(size=(n, 3))
-            channels |= {f"imu.{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
-    roll, pitch = _tilt(motion.base[:, 3:7])
-    channels["imu.angle_x"] = roll + noise.angle * rng.normal(size=n)
-    channels["imu.angle_y"] = pitch + noise.angle * rng.normal(size=n)
+    if motion.base is not None:
+        for name, sigma in (("gyro", noise.gyro), ("acc", noise.acc)):
+            if name in sensors:
+                values = sensors[name] + sigma * rng.normal(size=(n, 3))
+                channels |= {f"imu.{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
+        roll, pitch = _tilt(motion.base[0, :, 3:7])
+        channels["imu.angle_x"] = roll + noise.angle * rng.normal(size=n)
+        channels["imu.angle_y"] = pitch + noise.angle * rng.normal(size=n)
     channels |= {f"force.{k.removeprefix('force_')}": v[:, 0] for k, v in sensors.items() if k.startswith("force_")}
-    meta = LogMeta(robot=robot, mount="free", sample_period=task.period, source="hidden simulation")
+    mount: Literal["fixed", "free"] = "fixed" if motion.base is None else "free"
+    meta = LogMeta(robot=robot, mount=mount, sample_period=task.period, source="hidden simulation")
     return Log(task.time, channels, meta, np.zeros(n, dtype=np.int64))
 
 

@@ -22,7 +22,7 @@ class Risk:
     ----------
     weight : of the worst models, 0 to 1.
     share : of models that are the worst.
-    fall : what a fall costs, m/s.
+    fall : what a fall costs, in the task's unit.
     """
 
     weight: float = 0.25

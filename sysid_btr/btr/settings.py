@@ -68,7 +68,7 @@ class Settings:
     draws : models that Step 1 runs controllers in, drawn from what is believed, the ground's softness and friction and
         late commands among it; 1 is the believed model alone, as in the paper.
     risk : how falls and the worst of these models count.
-    worthwhile : m/s that another trial must promise for the loop to go on; None goes on.
+    worthwhile : fitness that another trial must promise for the loop to go on; None goes on.
     memory : trials that Step 3 explains, the newest first; those before are taken evenly.
     rivals : candidate models that may disagree.
     requirement : real fitness with which the work is done.

@@ -22,16 +22,12 @@ if TYPE_CHECKING:
     from sysid_btr.btr.controllers import ControllerSpace
     from sysid_btr.btr.robot import Robot
     from sysid_btr.btr.settings import Settings
-    from sysid_btr.btr.task import Walk
+    from sysid_btr.btr.task import Task
     from sysid_btr.estimators.base import Estimator
     from sysid_btr.models.robot import Robot as Model
 
 KEPT = ("journals", "trials", "closings", "learnt")
 """Folders of a run beside its results."""
-DURATIONS, LONG = {"ant": 3.0}, 8.0
-"""s of a trial by robot, and of any other."""
-LONGEST = 3600.0
-"""s of a trial."""
 DRAWS = 12
 """Models that controllers are searched in: the longer the search, the more it finds what suits these few alone."""
 BY_FITNESS, BY_SENSORS = 12, 2
@@ -61,6 +57,20 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
     wait: float | None = option(
         None, "Maximum time to wait for a recording.", otherwise="no limit", metavar="S", decides=False
     )
+    task: str = option(
+        "walk",
+        "What the robot is to do: walk, reach:PLACE=X,Y,Z (a body or site, m), track:FILE (the motion of a log), or a "
+        "task of your own.",
+        metavar="NAME|MODULE:NAME",
+        decides=True,
+    )
+    controllers: str | None = option(
+        None,
+        "Controllers that are searched: sine (a gait), spline, feedforward (of a motion), ant, nao, or your own.",
+        otherwise="those of a built-in robot that walks, else what suits the task",
+        metavar="NAME|MODULE:NAME",
+        decides=True,
+    )
     iterations: int = option(13, "Maximum number of iterations.", metavar="N", least=1, decides=False)
     trials: int | None = option(
         None,
@@ -71,7 +81,11 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     duration: float | None = option(
-        None, "Length of a trial.", otherwise="3 for the ant, else 8", metavar="S", decides=True
+        None,
+        "Length of a trial.",
+        otherwise="of a walk 8, of the ant's 3; 4 to reach a point; the log's, or your task's, own",
+        metavar="S",
+        decides=True,
     )
     distance: str = option(
         "phi1",
@@ -97,9 +111,9 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
     risk: float = option(
         0.25, "Weight of the worst quarter of these models beside their mean, 0 to 1.", metavar="WEIGHT", decides=True
     )
-    fall_cost: float = option(0.05, "What a fall costs in the search for controllers.", metavar="M/S", decides=True)
+    fall_cost: float = option(0.05, "What a fall costs in the search for controllers.", metavar="FITNESS", decides=True)
     worthwhile: float | None = option(
-        None, "Stop once another trial promises less than this.", metavar="M/S", decides=False
+        None, "Stop once another trial promises less than this.", metavar="FITNESS", decides=False
     )
     search: str = option(
         "ga", "How controllers are searched for: ga (the paper) or cmaes.", metavar="NAME", decides=True
@@ -111,7 +125,7 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         metavar="NAME",
         decides=True,
     )
-    requirement: float | None = option(None, "Stop once the robot walks this fast.", metavar="M/S", decides=False)
+    requirement: float | None = option(None, "Stop once the robot does it this well.", metavar="FITNESS", decides=False)
     close: bool = option(False, "Look for missing effects where no model explains the robot's logs.", decides=True)
 
 
@@ -122,9 +136,8 @@ def btr(options: BtrOptions) -> int:
     simulation that the search does not see (--robot-sim), or a real one behind a folder (--exchange). Exit 5 if
     the model no longer predicts which controller is better on the robot; the results are written all the same.
     """
-    from sysid_btr.btr.controllers import get_space
     from sysid_btr.btr.loop import back_to_reality
-    from sysid_btr.btr.task import Walk
+    from sysid_btr.btr.named import get_space, get_task
     from sysid_btr.result import exit_code
     from sysid_btr.terms.grammar import parse_parameters
 
@@ -132,11 +145,9 @@ def btr(options: BtrOptions) -> int:
     check_freed(model, options.fit)
     if options.resume and options.out is None:
         raise UsageError("--resume continues from the journals of an earlier run: give its --out folder")
-    space = get_space(model.name)
-    duration = DURATIONS.get(model.name, LONG) if options.duration is None else options.duration
-    if not 1 <= duration <= LONGEST:
-        raise UsageError(f"--duration {duration:g}: a trial takes 1 to {LONGEST:g} s")
-    task, settings = Walk(duration), settings_of(options, space)
+    task = get_task(options.task, model, options.duration)
+    space = get_space(options.controllers or "", model, task)
+    settings = settings_of(options, space)
     terms, robot = parse_parameters(options.fit, model), robot_of(options, model, task, space)
     folder = None if options.out is None else _open(options.out, options.resume, options.overwrite)
     began = perf_counter()
@@ -208,11 +219,11 @@ def settings_of(options: BtrOptions, space: ControllerSpace) -> Settings:
     return settings
 
 
-def robot_of(options: BtrOptions, model: Model, task: Walk, space: ControllerSpace) -> Robot:
+def robot_of(options: BtrOptions, model: Model, task: Task, space: ControllerSpace) -> Robot:
     """What the controllers are tried on."""
     from sysid_btr.btr.exchange import FolderExchange
     from sysid_btr.btr.robot import HiddenRobot, Noise
-    from sysid_btr.btr.world import make_world
+    from sysid_btr.btr.world import make_world, mount_of
     from sysid_btr.identify.replay import set_parameters
     from sysid_btr.models.builtin import load_robot
 
@@ -224,7 +235,9 @@ def robot_of(options: BtrOptions, model: Model, task: Walk, space: ControllerSpa
     if options.exchange is not None:
         if options.robot_set:
             raise UsageError("--robot-set applies to --robot-sim only")
-        return FolderExchange(options.exchange, task, space, model.name, patience=options.wait, say=remark)
+        return FolderExchange(
+            options.exchange, task, space, model.name, patience=options.wait, say=remark, mount=mount_of(model)
+        )
     hidden = load_robot(str(options.robot_sim))
     truth = set_parameters(hidden, options.robot_set)
     world = make_world(hidden, task, truth.terms, threads=1)

@@ -42,7 +42,7 @@ def plot_btr(
     figure = new_figure(13, 0.4 + 2.8 * rows) if figure is None else figure
     axes = list(figure.subplots(rows, columns, squeeze=False).ravel())
     _fitness(axes[0], result)
-    _difference(axes[1], rounds)
+    _difference(axes[1], rounds, _unit(result))
     for axis, name in zip(axes[2:], names, strict=False):
         _parameter(axis, rounds, name, (truth or {}).get(name))
     for axis in axes[:count]:
@@ -56,6 +56,12 @@ def plot_btr(
 def draw_btr(result: Mapping[str, Any], *, dark: bool = False, truth: Mapping[str, float] | None = None) -> bytes:
     """`plot_btr` as a PNG file, for a light or a dark page."""
     return on_page(lambda: figure_of(plot_btr(result, truth=truth)), dark=dark)
+
+
+def _unit(result: Mapping[str, Any]) -> str:
+    """Of the fitness, after its name."""
+    unit = result["units"]["fitness"]
+    return "" if unit == "1" else f" ({unit})"
 
 
 def _numbers(values: Sequence[float | None]) -> list[float]:
@@ -76,7 +82,7 @@ def _fitness(axis: Axes, result: Mapping[str, Any]) -> None:
         ("expected", "best in the model", PLAIN, "--"),
     ):
         axis.plot(x, _numbers([r["fitness"][key] for r in rounds]), line, color=colour, label=label)
-    axis.set_ylabel(f"fitness ({result['units']['fitness']})")
+    axis.set_ylabel(f"fitness{_unit(result)}")
     axis.legend(fontsize=7)
 
 
@@ -89,14 +95,14 @@ def _places(trials: Sequence[Mapping[str, Any]]) -> list[float]:
     return [n + BESIDE * (i - (rounds.count(n) - 1) / 2) for n, i in zip(rounds, order, strict=True)]
 
 
-def _difference(axis: Axes, rounds: Sequence[Mapping[str, Any]]) -> None:
+def _difference(axis: Axes, rounds: Sequence[Mapping[str, Any]], unit: str) -> None:
     x = [r["number"] for r in rounds]
     for key, label, colour, line in (
         ("transfer", "foreseen", PLAIN, "--"),
         ("corrected", "after correction", FOUND, "-"),
     ):
         axis.plot(x, _numbers([r["delta_fitness"][key] for r in rounds]), line, color=colour, label=label)
-    axis.set_ylabel("mean |model - robot| (m/s)")
+    axis.set_ylabel(f"mean |model - robot|{unit}")
     if any(v is not None and v > 0 for r in rounds for v in r["delta_fitness"].values()):
         axis.set_yscale("log")
     axis.legend(fontsize=7)
