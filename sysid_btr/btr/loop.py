@@ -145,16 +145,8 @@ class _Loop:
         settings = replace(self.settings, iterations=1, requirement=None, worthwhile=None)
         parameters = [(p.name, p.nominal, p.lower, p.upper) for p in self.stage.parameters]
         bounds = [self.space.lower.tolist(), self.space.upper.tolist(), self.space.start.tolist()]
-        content = [
-            __version__,
-            self.model.fingerprint,
-            parameters,
-            bounds,
-            self.task.fingerprint,
-            repr(settings),
-            self.seed,
-        ]
-        content.append(self.fingerprint)
+        own = [self.model.fingerprint, self.task.fingerprint, self.fingerprint]
+        content = [__version__, *own, parameters, bounds, repr(settings), self.seed]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def go(self) -> BackToReality:
@@ -535,8 +527,8 @@ def _believed(drawn: Imagination, settings: Settings, task: Task) -> str:
     fall = f", and a fall as {task.in_words(-risk.fall)}" if task.falls else ""
     return (
         f"controllers are searched for in {settings.draws} of {len(drawn.models)} models that differ in "
-        f"{', '.join(called)}; what counts is the mean fitness in them ({task.goal}), by {100 * risk.weight:.0f} % that "
-        f"in the worst {100 * risk.share:.0f} %{fall}"
+        f"{', '.join(called)}; what counts is the mean fitness in them ({task.goal}), by {100 * risk.weight:.0f} % that"
+        f" in the worst {100 * risk.share:.0f} %{fall}"
     )
 
 

@@ -115,11 +115,8 @@ class World(Replay):
         n, index, model = outputs.position.shape[1], self.index, self.model
         qpos, qvel = np.tile(model.qpos0, (n, 1)), np.zeros((n, model.nv))
         if index.base is not None and outputs.base is not None:
-            place, motion = index.base
-            qpos[:, place : place + 7], qvel[:, motion : motion + 6] = (
-                outputs.base[row, :, :7],
-                outputs.base[row, :, 7:],
-            )
+            (place, motion), base = index.base, outputs.base[row]
+            qpos[:, place : place + 7], qvel[:, motion : motion + 6] = base[:, :7], base[:, 7:]
         qpos[:, index.qpos], qvel[:, index.dof] = outputs.position[row], outputs.velocity[row]
         return {"qpos": np.nan_to_num(qpos), "qvel": np.nan_to_num(qvel)}
 
