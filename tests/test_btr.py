@@ -438,7 +438,10 @@ def test_what_was_foreseen_is_said_beside_what_happened(improved: BackToReality)
     said: list[str] = []
     tiny(hidden(), settings=replace(IMPROVING, iterations=1), say=said.append)
     result = json.loads(to_json(improved.to_dict()))
-    assert "models that differ in length, coulomb_friction, command_delay, foot_friction, foot_compliance" in said[0]
+    assert (
+        "models that differ in length, coulomb_friction, command_delay, com_offset, foot_friction, foot_compliance"
+        in said[0]
+    )
     for trial, line in zip(result["trials"][:2], said[1:], strict=False):
         foreseen = trial["foreseen"]
         assert foreseen["low"] < foreseen["fitness"] < foreseen["high"]
@@ -734,7 +737,7 @@ def test_a_recording_on_another_clock_is_read_on_the_tasks(tmp_path: Path) -> No
 
 COMMAND = (
     *("btr", "--model", "ant", "--fit", "length:LFFemur", "--robot-sim", "ant", "--robot-set", "length:LFFemur=1.2"),
-    *("--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1", "--draws", "2"),
+    *("--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1", "--draws", "2", "--search", "ga"),
 )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sysid_btr.btr.belief import Belief
+from sysid_btr.floating_base.size import measure_size
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.terms.base import Parameter
 from sysid_btr.terms.grammar import parse_parameters
@@ -81,8 +82,8 @@ def test_numbers_that_do_not_belong_to_the_parameters_are_refused() -> None:
 
 def test_gears_are_expected_to_rub_by_half_a_degree_of_a_servo() -> None:
     nao = load_robot("nao")
-    terms, belief = Belief.unmeasured(nao, parse_parameters(["mass:Torso"], nao), ground=False)
-    std = dict(zip((term.name for term in terms), belief.std, strict=True))
+    belief = Belief.unmeasured(nao, parse_parameters(["mass:Torso"], nao), ground=False)[1]
+    std = {p.name.partition(":")[0]: s for p, s in zip(belief.parameters, belief.std, strict=True)}
     assert std["coulomb_friction"] == pytest.approx(0.01 * np.median(nao.model.actuator_gainprm[:, 0]))
     assert std["command_delay"] == pytest.approx(0.02)
 
@@ -96,3 +97,17 @@ def test_how_much_gears_rub_is_counted_at_the_joint(gear: int, kp: float, tmp_pa
     )
     terms, belief = Belief.unmeasured(load_robot(str(path)), (), ground=False)
     assert dict(zip((t.name for t in terms), belief.std, strict=True))["coulomb_friction"] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("name", ["nao", "ant"])
+def test_what_carries_most_may_have_its_centre_a_little_off(name: str) -> None:
+    robot = load_robot(name)
+    terms, belief = Belief.unmeasured(robot, ())
+    (moved,) = [term for term in terms if term.name == "com_offset"]
+    heaviest = max(range(1, robot.model.nbody), key=lambda b: float(robot.model.body_mass[b]))
+    assert moved.places == (robot.model.body(heaviest).name,)
+    std = dict(zip((p.name for p in belief.parameters), belief.std, strict=True))
+    along = {std[p.name] for p in moved.parameters}
+    assert along == {0.01 * measure_size(robot.model).length(1.0)}
+    declared = parse_parameters([f"com_offset:{moved.places[0]}"], robot)
+    assert "com_offset" not in {term.name for term in Belief.unmeasured(robot, declared)[0]}

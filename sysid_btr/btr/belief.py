@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.floating_base.size import measure_size
 from sysid_btr.models.robot import Robot, servo_drives
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.terms.base import Parameter, Term
@@ -15,13 +16,20 @@ from sysid_btr.terms.effect import GROUND
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
-DRY = "coulomb_friction"
-UNMEASURED: Mapping[str, float] = {"foot_compliance": 0.5, "foot_friction": 0.2, "command_delay": 0.02, DRY: 0.01}
+DRY, LOADED = "coulomb_friction", "com_offset"
+UNMEASURED: Mapping[str, float] = {
+    "foot_compliance": 0.5,
+    "foot_friction": 0.2,
+    "command_delay": 0.02,
+    DRY: 0.01,
+    LOADED: 0.01,
+}
 """What no trial measures by itself, or nobody declares: effect -> standard deviation about its neutral value.
 
 A ground is as soft as nobody knows; grass, carpet and tiles under rubber differ by tens of percent in friction; a bus
 and a servo's own cycle take a few periods of 10 to 20 ms; and gears rub, so that servos stop half a degree off (rad:
-times their stiffness, that is a torque).
+times their stiffness, that is a torque). Cables, batteries and loads leave the centre of what carries most a centimetre
+off, on a robot of the Nao's size (m): whether a gait falls depends on it, and a mass that is learnt says nothing of it.
 """
 WIDTH = 2.0
 """Standard deviation of a parameter before anything is known, in changes that matter (`Parameter.scale`)."""
@@ -81,11 +89,11 @@ class Belief:
         ground = ground and len(free_joints(robot.model)) > 0
         found: list[Term] = []
         for effect in select_effects([name for name in UNMEASURED if name not in there] or ["all"]):
-            places = robot.names(effect.scope)
+            places = _heaviest(robot) if effect.name == LOADED else robot.names(effect.scope)
             asked = effect.name in UNMEASURED and not effect.variant and (ground or effect.needs != GROUND)
             if asked and effect.name not in there and places:
                 found.append(effect(places=places, shared=len(places) > 1))
-        size = {DRY: _stiffness(robot)}
+        size = {DRY: _stiffness(robot), LOADED: _length(robot)}
         std = np.array([UNMEASURED[term.name] * size.get(term.name, 1.0) for term in found for _ in term.parameters])
         listed = Terms(found)
         return tuple(found), cls(listed.parameters, listed.nominal, np.diag(std**2))
@@ -154,6 +162,17 @@ class Belief:
             normal[:, i] = ndtri(np.clip(low + even[:, i] * (high - low), 1e-16, 1 - 1e-16))
             result[:, i] = np.clip(middle + normal[:, i] * root[i, i], lower[i], upper[i])
         return result
+
+
+def _heaviest(robot: Robot) -> tuple[str, ...]:
+    """The body of most mass of a robot that may fall; none of one whose base is fixed."""
+    model = robot.model
+    return (model.body(int(np.argmax(model.body_mass))).name,) if len(free_joints(model)) else ()
+
+
+def _length(robot: Robot) -> float:
+    """Of a robot that may fall, over the Nao's."""
+    return measure_size(robot.model).length(1.0) if len(free_joints(robot.model)) else 1.0
 
 
 def _stiffness(robot: Robot) -> float:

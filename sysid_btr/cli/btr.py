@@ -116,7 +116,7 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         None, "Stop once another trial promises less than this.", metavar="FITNESS", decides=False
     )
     search: str = option(
-        "ga", "How controllers are searched for: ga (the paper) or cmaes.", metavar="NAME", decides=True
+        "cmaes", "How controllers are searched for: cmaes, or ga (the paper).", metavar="NAME", decides=True
     )
     model_search: str | None = option(
         None,
