@@ -737,7 +737,8 @@ def test_a_recording_on_another_clock_is_read_on_the_tasks(tmp_path: Path) -> No
 
 COMMAND = (
     *("btr", "--model", "ant", "--fit", "length:LFFemur", "--robot-sim", "ant", "--robot-set", "length:LFFemur=1.2"),
-    *("--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1", "--draws", "2", "--search", "ga"),
+    *("--iterations", "1", "--trials", "1", "--duration", "1", "--threads", "1", "--draws", "2"),
+    *("--search", "ga", "--distance", "phi1"),
 )
 
 

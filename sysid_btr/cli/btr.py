@@ -30,8 +30,8 @@ KEPT = ("journals", "trials", "closings", "learnt")
 """Folders of a run beside its results."""
 DRAWS = 12
 """Models that controllers are searched in: the longer the search, the more it finds what suits these few alone."""
-BY_FITNESS, BY_SENSORS = 12, 2
-"""Trials of an iteration where models are judged by fitness, and where by sensors (the paper's m)."""
+BY_FITNESS, BY_SENSORS = 12, 4
+"""Trials of an iteration where models are judged by fitness (the paper's m), and where by sensors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +71,11 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         metavar="NAME|MODULE:NAME",
         decides=True,
     )
-    iterations: int = option(13, "Maximum number of iterations.", metavar="N", least=1, decides=False)
+    iterations: int = option(5, "Maximum number of iterations; 13 in the paper.", metavar="N", least=1, decides=False)
     trials: int | None = option(
         None,
         "Number of trials on the robot in each iteration.",
-        otherwise="12; 2 without phi1",
+        otherwise="4; 12 with phi1",
         metavar="N",
         least=1,
         decides=True,
@@ -88,8 +88,9 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     distance: str = option(
-        "phi1",
-        "How models are compared with the robot: phi1, phi2[:BINS], mse, wasserstein, likelihood.",
+        "likelihood",
+        "How models are compared with the robot: by the likelihood of the trials' logs, whatever the ground does; or by "
+        "phi1 (fitness, the paper), phi2[:BINS], mse, wasserstein of whole trials.",
         metavar="NAME",
         decides=True,
     )
