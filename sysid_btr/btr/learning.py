@@ -64,7 +64,8 @@ class Learnt:
 
     def __str__(self) -> str:
         left = f"of the trials {self.before**0.5:.3g}, then {self.after**0.5:.3g} noise floors are left"
-        return f"{left}; the model {'is corrected' if self.explained else 'lacks something, and stays as it was'}"
+        corrected = "is corrected" if self.after < self.before else "explains them as it is"
+        return f"{left}; the model {corrected if self.explained else 'lacks something, and stays as it was'}"
 
 
 def usable_logs(trials: Sequence[Trial], most: int = LOGS) -> list[Log]:
@@ -127,6 +128,8 @@ def learn(
         if np.all(moved <= SETTLED * std):
             break
     study, found = min(reached, key=lambda pair: pair[1].train if np.isfinite(pair[1].train) else np.inf)
+    if not found.train < first.train:
+        return Learnt(belief, first.train, first.train, first.train <= study.procedure.tolerated, spent)
     model, explained = found.model, found.train <= study.procedure.tolerated
     if explained:
         problem = MapProblem(study.train_problem(model), own)

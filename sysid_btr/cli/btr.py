@@ -89,8 +89,8 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
     )
     distance: str = option(
         "likelihood",
-        "How models are compared with the robot: by the likelihood of the trials' logs, whatever the ground does; or by "
-        "phi1 (fitness, the paper), phi2[:BINS], mse, wasserstein of whole trials.",
+        "How models are compared with the robot: by the likelihood of the trials' logs, whatever the ground does; by "
+        "phi1 (fitness, the paper); or by phi2[:BINS], mse, wasserstein of whole trials.",
         metavar="NAME",
         decides=True,
     )
