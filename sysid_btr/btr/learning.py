@@ -64,7 +64,7 @@ class Learnt:
 
     def __str__(self) -> str:
         left = f"of the trials {self.before**0.5:.3g}, then {self.after**0.5:.3g} noise floors are left"
-        corrected = "is corrected" if self.after < self.before else "explains them as it is"
+        corrected = "explains them as it is" if self.after == self.before else "is corrected"
         return f"{left}; the model {corrected if self.explained else 'lacks something, and stays as it was'}"
 
 
@@ -128,9 +128,9 @@ def learn(
         if np.all(moved <= SETTLED * std):
             break
     study, found = min(reached, key=lambda pair: pair[1].train if np.isfinite(pair[1].train) else np.inf)
-    if not found.train < first.train:
-        return Learnt(belief, first.train, first.train, first.train <= study.procedure.tolerated, spent)
     model, explained = found.model, found.train <= study.procedure.tolerated
+    if not explained and first.train <= study.procedure.tolerated:
+        return Learnt(belief, first.train, first.train, True, spent)
     if explained:
         problem = MapProblem(study.train_problem(model), own)
         # the logs' noise is inflated by what is left of them, and by how long that remembers
