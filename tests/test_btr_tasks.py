@@ -383,6 +383,7 @@ def test_the_verb_reaches_follows_and_does_ones_own(own: Path, capsys: pytest.Ca
     (own / "leg.xml").write_text(toys.LEG)
     write_log(moving(1.5), own / "motion.parquet")
     small = ("--iterations", "1", "--trials", "1", "--draws", "2", "--threads", "1", "--fit", "kp:*=shared")
+    small = (*small, "--search", "ga", "--duration", "1")
     command = ("btr", "--model", "leg.xml", "--robot-sim", "leg.xml", "--robot-set", "kp:*=0.8", *small)
     for name, told in (("reach:ankle=0.1,0,-0.2", "m"), ("track:motion.parquet", "1"), ("own_btr:still", "rad")):
         out = own / name.partition(":")[0]
@@ -393,7 +394,7 @@ def test_the_verb_reaches_follows_and_does_ones_own(own: Path, capsys: pytest.Ca
         assert result["units"] == {"fitness": told}
         assert result["task"]["fitness"] in (out / "report.html").read_text()
     capsys.readouterr()
-    assert run([*command, "--task", "own_btr:still", "--duration", "0.1"]) == 2
+    assert run([*command[:-1], "0.1", "--task", "own_btr:still"]) == 2
     assert "a trial takes 1 to" in capsys.readouterr().err
 
 
