@@ -29,10 +29,10 @@ from sysid_btr.btr.learning import model_fit
 from sysid_btr.btr.loop import back_to_reality
 from sysid_btr.btr.named import get_space, get_task
 from sysid_btr.btr.outcome import BackToReality
-from sysid_btr.btr.problems import Stage, judged
+from sysid_btr.btr.problems import Stage
 from sysid_btr.btr.robot import SILENT, HiddenRobot, Noise
 from sysid_btr.btr.settings import Settings
-from sysid_btr.btr.task import Motion, Reach, Task, Track, Walk
+from sysid_btr.btr.task import Motion, Reach, Task, Track, Walk, judged
 from sysid_btr.btr.world import make_world
 from sysid_btr.cli import run
 from sysid_btr.errors import InterruptedRun, LogError, UsageError
@@ -41,6 +41,7 @@ from sysid_btr.io.log import Log
 from sysid_btr.io.parquet import read_log, write_log
 from sysid_btr.io.validation import validate_log
 from sysid_btr.models.builtin import load_robot
+from sysid_btr.models.robot import joint_ranges
 from sysid_btr.terms.grammar import parse_parameters
 from sysid_btr.terms.model import Terms
 
@@ -88,6 +89,21 @@ def test_a_motion_that_is_followed_is_worth_one_and_a_robot_that_stays_nothing()
         Track.of_log(toys.held())
 
 
+def test_a_log_that_shows_no_single_motion_is_not_tracked() -> None:
+    log = moving()
+    shown = {f"position.{j}": log.channels[f"command.{j}"].copy() for j in toys.LEG_JOINTS}
+    shown["position.knee"][20:25] = np.nan
+    with pytest.raises(LogError, match="knee has positions missing"):
+        Track.of_log(replace(log, channels=shown))
+    with pytest.raises(LogError, match="2 episodes, and a trial has one motion"):
+        Track.of_log(replace(log, episode=(log.time > 1).astype(np.int64)))
+    late = log.time.copy()
+    late[30] = late[29]
+    for channels in (log.channels, shown):
+        with pytest.raises(LogError, match="time does not increase strictly at sample 30"):
+            Track.of_log(replace(log, time=late, channels=channels))
+
+
 def test_what_decides_which_trials_are_made_is_told_apart() -> None:
     log = moving()
     other = replace(log, channels={**log.channels, "command.hip": 1.1 * log.channels["command.hip"]})
@@ -116,7 +132,7 @@ def test_a_fitness_of_another_shape_is_refused_and_one_that_diverged_has_none() 
     motion = Motion(("a",), np.array([[[0.0]], [[np.nan]]]))
     with pytest.raises(UsageError, match="Wrong: its fitness of 2 motions"):
         judged(Wrong(), motion)
-    np.testing.assert_array_equal(judged(Sure(), motion), [1.0, np.nan])
+    np.testing.assert_array_equal(judged(Sure(), motion)[0], [1.0, np.nan])
 
 
 # --- controllers --------------------------------------------------------------------------------------------------
@@ -157,8 +173,6 @@ def test_a_gait_of_any_legs_stays_within_the_joints_limits(name: str) -> None:
     check_space(space, robot, Walk().time)
     values = np.random.default_rng(0).uniform(space.lower, space.upper, (20, len(space.names)))
     commands = space.commands(values, np.arange(100) * 0.02)
-    from sysid_btr.models.robot import joint_ranges
-
     ends = joint_ranges(robot)
     for i, joint in enumerate(space.joints):
         low, high = ends.get(joint, (-np.inf, np.inf))
@@ -303,8 +317,6 @@ class Still(Task):
 
 
 class Lazy(Task):
-    goal = "nothing"
-
     def fitness(self, motion):
         return np.zeros(len(motion.position))
 
@@ -318,6 +330,32 @@ def for_robot(robot):
 
 
 number = 3
+
+
+class Failing(Still):
+    def fitness(self, motion):
+        return motion.nothing
+
+
+class Stray(SineGait):
+    def commands(self, values, time):
+        return self.nothing
+
+
+class Unfinished(Task):
+    pass
+
+
+class Asking(Still):
+    def __init__(self, what):
+        pass
+
+
+def refusing(robot):
+    raise ValueError("not this robot")
+
+
+stray = Stray(("hip",), (0.0,), (0.2,))
 """
 
 
@@ -336,7 +374,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_tasks_and_controllers_may_be_ones_own() -> None:
     before = list(sys.path)
     assert get_task("own_btr:Still", LEG).duration == 2.0
-    assert get_task("own_btr:still", LEG).duration == 1.0
+    assert get_task("own_btr:still", LEG).duration == get_task("own_btr.py:still", LEG).duration == 1.0
     assert get_task("own_btr:Lazy", LEG, 3.0).time[-1] == pytest.approx(3.0)
     assert get_space("own_btr:space", LEG, REACH).joints == ("hip",)
     assert get_space("own_btr:for_robot", LEG, REACH).joints == ("hip", "knee")
@@ -353,6 +391,10 @@ def test_tasks_and_controllers_may_be_ones_own() -> None:
         ("own_btr:number", "that is no task"),
         ("broken_btr:x", "ZeroDivisionError: division by zero"),
         ("needing_btr:x", "needs nothing_like_it, which is not installed"),
+        ("own_btr:Unfinished", "TypeError: Can't instantiate abstract class Unfinished"),
+        ("own_btr:Asking", "missing 1 required positional argument: 'what'"),
+        ("own_btr:refusing", "failed: ValueError: not this robot (own_btr.py, line"),
+        ("no_such.py:x", "there is no module no_such in"),
         ("reach:ankle", "reach:PLACE=X,Y,Z"),
         ("reach:ankle=0,1", "reach:PLACE=X,Y,Z"),
         ("reach:ankle=0,1,inf", "reach:PLACE=X,Y,Z"),
@@ -370,6 +412,7 @@ def test_a_task_that_does_not_exist_is_refused(text: str, told: str) -> None:
     ("text", "told"),
     [
         ("own_btr:number", "that is no controller space, it lacks names, lower"),
+        ("own_btr:refusing", "failed: ValueError: not this robot (own_btr.py, line"),
         ("feedforward", "--task track:FILE"),
         ("walking", "available are sine, spline, feedforward, ant, nao, or MODULE:NAME"),
     ],
@@ -377,6 +420,16 @@ def test_a_task_that_does_not_exist_is_refused(text: str, told: str) -> None:
 def test_controllers_that_do_not_exist_are_refused(text: str, told: str) -> None:
     with pytest.raises(UsageError, match=re.escape(told)):
         get_space(text, LEG, REACH)
+
+
+@pytest.mark.usefixtures("own")
+def test_what_fails_in_ones_own_code_is_said_to_be_there() -> None:
+    failing, stray = get_task("own_btr:Failing", LEG), get_space("own_btr:stray", LEG, REACH)
+    told = r"failed: AttributeError: .* has no attribute 'nothing' \(own_btr.py, line \d+\)"
+    with pytest.raises(UsageError, match=f"task Failing {told}"):
+        judged(failing, Motion(("a",), np.zeros((1, 2, 1))))
+    with pytest.raises(UsageError, match=f"controllers Stray {told}"):
+        check_space(stray, LEG, REACH.time)
 
 
 def test_the_verb_reaches_follows_and_does_ones_own(own: Path, capsys: pytest.CaptureFixture[str]) -> None:

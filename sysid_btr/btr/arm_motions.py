@@ -10,6 +10,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.controllers import commanded_joints, rest_of
 from sysid_btr.errors import UsageError
+from sysid_btr.interpolation import clamped_knots, smooth_step
 from sysid_btr.io._text import some
 from sysid_btr.models.robot import Robot, joint_ranges
 
@@ -64,9 +65,8 @@ class SplineMotion:
         free = values.reshape(len(values), len(self.joints), self.points)
         still = np.broadcast_to(np.array(self.rest)[:, None], (*free.shape[:2], 2))
         points = np.concatenate([still, free, free[:, :, -1:]], axis=2)
-        inner = np.linspace(0.0, 1.0, points.shape[2] - DEGREE + 1)
-        knots = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
-        shares = BSpline(knots, np.eye(points.shape[2]), DEGREE)(np.clip(time / self.duration, 0.0, 1.0))
+        count = points.shape[2]
+        shares = BSpline(clamped_knots(count, DEGREE), np.eye(count), DEGREE)(np.clip(time / self.duration, 0.0, 1.0))
         return np.asarray(np.einsum("nk,mjk->mnj", shares, points))
 
 
@@ -131,8 +131,7 @@ class FeedForward:
         return np.zeros(3 * len(self.joints))
 
     def commands(self, values: FloatArray, time: FloatArray) -> FloatArray:
-        share = np.clip(time / self.ramp, 0.0, 1.0)[None, :, None]
-        grown = share * share * (3 - 2 * share)
+        grown = smooth_step(time / self.ramp)[None, :, None]
         lead, gain, offset = np.moveaxis(values.reshape(len(values), 1, len(self.joints), 3), 3, 0)
         at = np.clip((time[None, :, None] + grown * lead) / self.period, 0.0, len(self.wanted) - 1)
         before = np.minimum(at.astype(np.int64), len(self.wanted) - 2)

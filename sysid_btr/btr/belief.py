@@ -12,7 +12,7 @@ from sysid_btr.floating_base.size import measure_size
 from sysid_btr.models.robot import Robot, servo_drives
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.terms.base import Parameter, Term
-from sysid_btr.terms.effect import GROUND
+from sysid_btr.terms.effect import GROUND, Effect
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
@@ -86,17 +86,16 @@ class Belief:
         ground : whether the ground is asked for, too.
         """
         there = {term.name for term in terms}
-        ground = ground and len(free_joints(robot.model)) > 0
         found: list[Term] = []
         for effect in select_effects([name for name in UNMEASURED if name not in there] or ["all"]):
-            places = _heaviest(robot) if effect.name == LOADED else robot.names(effect.scope)
-            asked = effect.name in UNMEASURED and not effect.variant and (ground or effect.needs != GROUND)
-            if asked and effect.name not in there and places:
+            places = _places(robot, effect, ground)
+            if effect.name in UNMEASURED and not effect.variant and effect.name not in there and places:
                 found.append(effect(places=places, shared=len(places) > 1))
-        size = {DRY: _stiffness(robot), LOADED: _length(robot)}
-        std = np.array([UNMEASURED[term.name] * size.get(term.name, 1.0) for term in found for _ in term.parameters])
+        sized = {DRY: _stiffness, LOADED: _length}
+        std = [UNMEASURED[term.name] * sized.get(term.name, lambda _: 1.0)(robot) for term in found]
+        variance = np.repeat(np.square(std), [len(term.parameters) for term in found])
         listed = Terms(found)
-        return tuple(found), cls(listed.parameters, listed.nominal, np.diag(std**2))
+        return tuple(found), cls(listed.parameters, listed.nominal, np.diag(variance))
 
     def towards(self, found: FloatArray, noise: float) -> Belief:
         """The belief where a fit found other values that leave a residual of so many noise floors.
@@ -164,15 +163,20 @@ class Belief:
         return result
 
 
-def _heaviest(robot: Robot) -> tuple[str, ...]:
-    """The body of most mass of a robot that may fall; none of one whose base is fixed."""
-    model = robot.model
-    return (model.body(int(np.argmax(model.body_mass))).name,) if len(free_joints(model)) else ()
+def _places(robot: Robot, effect: type[Effect], ground: bool) -> tuple[str, ...]:
+    """Where something may differ; nowhere on a robot whose base is fixed what only one that may fall has."""
+    floats = len(free_joints(robot.model)) > 0
+    if effect.needs == GROUND and not (ground and floats):
+        return ()
+    if effect.name != LOADED:
+        return robot.names(effect.scope)
+    heaviest = int(np.argmax(robot.model.body_mass))
+    return (robot.model.body(heaviest).name,) if floats else ()
 
 
 def _length(robot: Robot) -> float:
     """Of a robot that may fall, over the Nao's."""
-    return measure_size(robot.model).length(1.0) if len(free_joints(robot.model)) else 1.0
+    return measure_size(robot.model).length(1.0)
 
 
 def _stiffness(robot: Robot) -> float:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from sysid_btr._typing import FloatArray
+from sysid_btr.btr.own_code import blamed
 from sysid_btr.errors import UsageError
 from sysid_btr.io.log import Log, LogMeta, with_hint
 from sysid_btr.models.pose import resting
@@ -113,7 +114,8 @@ def check_space(space: ControllerSpace, robot: Robot, time: FloatArray) -> None:
     for joint in space.joints:
         if joint not in there:
             raise UsageError(f"{called}: model {robot.name} has no joint {with_hint(joint, there)}")
-    found = np.asarray(space.commands(start[None], time))
+    with blamed(called):
+        found = np.asarray(space.commands(start[None], time))
     if found.shape != (1, len(time), len(space.joints)):
         raise UsageError(
             f"{called}: the commands of one controller at {len(time)} times have the shape {found.shape}; wanted are "

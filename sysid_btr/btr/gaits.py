@@ -11,6 +11,7 @@ import numpy as np
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.controllers import commanded_joints, rest_of
 from sysid_btr.errors import UsageError
+from sysid_btr.interpolation import smooth_step
 from sysid_btr.models.ant import JOINTS
 from sysid_btr.models.gait import ARMS, Gait, gait
 from sysid_btr.models.robot import Robot, joint_ranges
@@ -59,8 +60,7 @@ class SineGait:
         return start
 
     def commands(self, values: FloatArray, time: FloatArray) -> FloatArray:
-        share = np.clip(time / self.ramp, 0.0, 1.0)
-        grown = share * share * (3 - 2 * share)
+        grown = smooth_step(time / self.ramp)
         angle = 2 * np.pi * self.frequency * time[None, :, None] + values[:, None, 1::2]
         return np.asarray(np.array(self.centre) + values[:, None, ::2] * grown[None, :, None] * np.sin(angle))
 

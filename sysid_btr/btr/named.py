@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +12,9 @@ import numpy as np
 from sysid_btr.btr.arm_motions import feed_forward, spline_motion
 from sysid_btr.btr.controllers import ControllerSpace
 from sysid_btr.btr.gaits import NaoGait, ant_gait, sine_gait
+from sysid_btr.btr.own_code import load_own
 from sysid_btr.btr.task import Reach, Task, Track, Walk
 from sysid_btr.errors import UsageError
-from sysid_btr.io.log import with_hint
 from sysid_btr.io.parquet import read_log
 from sysid_btr.models.robot import Robot
 
@@ -27,7 +24,6 @@ LONGEST = 3600.0
 """s of a trial."""
 MOVING = 0.7
 """Share of a trial in which a spline comes to its end."""
-OWN = "or MODULE:NAME of your own"
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ def get_task(text: str, robot: Robot, duration: float | None = None) -> Task:
     if kind in TASKS:
         task: Task = TASKS[kind].make(rest, robot, duration)
     else:
-        task = _own("--task", text, TASKS, robot)
+        task = load_own(f"--task {text}", text, robot, _available(TASKS))
         if not isinstance(task, Task):
             raise UsageError(f"--task {text}: that is no task; derive it from sysid_btr.btr.task.Task")
         task = task if duration is None else replace(task, duration=duration)
@@ -90,7 +86,7 @@ def get_space(text: str, robot: Robot, task: Task) -> ControllerSpace:
     if kind in CONTROLLERS:
         found: ControllerSpace = CONTROLLERS[kind].make(rest, robot, task)
         return found
-    own = _own("--controllers", text, CONTROLLERS, robot)
+    own = load_own(f"--controllers {text}", text, robot, _available(CONTROLLERS))
     lacking = [part for part in ("names", "lower", "upper", "start", "joints", "commands") if not hasattr(own, part)]
     if lacking:
         raise UsageError(
@@ -109,46 +105,8 @@ def _suiting(robot: Robot, task: Task) -> str:
     return next((name for kind, name in SUITING if isinstance(task, kind)), "spline")
 
 
-def _own(flag: str, text: str, ready: Mapping[str, Ready], robot: Robot) -> Any:
-    """An object of the user's module; what is called with the robot to make it, if it is a function, or a class.
-
-    Raises
-    ------
-    UsageError
-        If there is no such module or name, or the module fails.
-    """
-    module, _, name = text.partition(":")
-    if not name:
-        raise UsageError(f"{flag} {text}: available are {', '.join(r.form for r in ready.values())}, {OWN}")
-    try:
-        with _looked_for_here():
-            there = import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name != module:
-            raise UsageError(f"{flag} {text}: {module} needs {error.name}, which is not installed") from error
-        raise UsageError(
-            f"{flag} {text}: there is no module {module} in {Path.cwd()} or among what is installed; available are "
-            f"{', '.join(r.form for r in ready.values())}, {OWN}"
-        ) from None
-    except Exception as error:
-        raise UsageError(f"{flag} {text}: {module} cannot be imported: {type(error).__name__}: {error}") from error
-    if not hasattr(there, name):
-        known = [n for n in vars(there) if not n.startswith("_")]
-        raise UsageError(f"{flag} {text}: module {module} has no {with_hint(name, known)}")
-    own = getattr(there, name)
-    if isinstance(own, type):
-        return own()
-    return own(robot) if callable(own) and not isinstance(own, Task) else own
-
-
-@contextmanager
-def _looked_for_here() -> Iterator[None]:
-    """Modules of the present folder can be imported."""
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        yield
-    finally:
-        sys.path.pop(0)
+def _available(ready: Mapping[str, Ready]) -> str:
+    return f"{', '.join(r.form for r in ready.values())}, or MODULE:NAME of your own"
 
 
 def _walk(_rest: str, robot: Robot, duration: float | None) -> Task:

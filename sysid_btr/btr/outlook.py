@@ -149,7 +149,7 @@ class Outlook:
     controllers: FloatArray
     drawn: Drawn
     asked: IntArray
-    falls: bool = True
+    falls: bool
 
     def foresee(self, made: Sequence[Tried]) -> Foresight:
         """What is foreseen of the next ones, given trials; those of other controllers are passed over."""

@@ -11,10 +11,10 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
 from sysid_btr.btr.controllers import ControllerSpace
+from sysid_btr.btr.own_code import blamed
 from sysid_btr.btr.robot import Trial
-from sysid_btr.btr.task import Motion, Task
+from sysid_btr.btr.task import Task, judged
 from sysid_btr.btr.world import World
-from sysid_btr.errors import UsageError
 from sysid_btr.estimators.base import Problem
 from sysid_btr.io.log import Log
 from sysid_btr.objectives.distance import Distance, get_distance, phi1
@@ -45,7 +45,9 @@ class Stage:
 
     def commands(self, controllers: FloatArray) -> FloatArray:
         """Commands (m, n, j) of controllers (m, p) for all joints of the model."""
-        return self.world.spread(self.space.joints, self.space.commands(controllers, self.task.time))
+        with blamed(f"controllers {type(self.space).__name__}"):
+            commands = self.space.commands(controllers, self.task.time)
+        return self.world.spread(self.space.joints, commands)
 
     def fitness(self, controllers: FloatArray, models: FloatArray) -> FloatArray:
         """Fitness (k, m) of controllers (m, p) in models (k, q); NaN where the simulation diverged."""
@@ -64,26 +66,9 @@ class Stage:
             values = models[model[rows]]
             for part, outputs in self.world.run(commands[which[rows]], values):
                 motion = self.world.motion(outputs, values[part], self.task.watched)
-                fitness[rows][part] = judged(self.task, motion)
-                fell[rows][part] = self.task.fallen(motion)[:, -1]
+                fitness[rows][part], fallen = judged(self.task, motion)
+                fell[rows][part] = fallen[:, -1]
         return fitness.reshape(k, m), fell.reshape(k, m) | np.isnan(fitness).reshape(k, m)
-
-
-def judged(task: Task, motion: Motion) -> FloatArray:
-    """Fitness (m,) of motions; NaN where a simulation diverged, whatever the task makes of that.
-
-    Raises
-    ------
-    UsageError
-        If a task's fitness is not one number for each motion.
-    """
-    found = np.asarray(task.fitness(motion), dtype=np.float64)
-    if found.shape != (len(motion.position),):
-        raise UsageError(
-            f"task {type(task).__name__}: its fitness of {len(motion.position)} motions has the shape {found.shape}; "
-            f"one number for each motion is wanted, ({len(motion.position)},)"
-        )
-    return np.where(np.isfinite(motion.position).all(axis=(1, 2)), found, np.nan)
 
 
 def _blocks(count: int, size: int = 256) -> list[slice]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.controllers import Controller, ControllerSpace
-from sysid_btr.btr.task import Motion, Task
+from sysid_btr.btr.task import Motion, Task, judged
 from sysid_btr.btr.world import World
 from sysid_btr.io.log import Log, LogMeta
 
@@ -123,9 +123,9 @@ def recorded(
     noise, rng : of the sensors.
     robot : its name, for the log.
     """
-    down = task.fallen(played.motion)[0]
+    (reached,), (down,) = judged(task, played.motion)
     log = _log(played, task, joints, noise, rng, robot)
-    fitness = float(task.fitness(played.motion)[0]) + noise.fitness * rng.normal()
+    fitness = float(reached) + noise.fitness * rng.normal()
     if down.any():
         # what lies on the ground is hardly informative: the recording stops there
         return Trial(log.window(0, max(int(np.argmax(down)), 2)), fitness, "fallen")

@@ -12,12 +12,14 @@ from typing import ClassVar
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
+from sysid_btr.btr.own_code import blamed
 from sysid_btr.errors import LogError, UsageError
 from sysid_btr.io._text import some
 from sysid_btr.io.log import Log, with_hint
-from sysid_btr.io.resample import command_at
+from sysid_btr.io.resample import command_at, resample
 from sysid_btr.models.robot import Robot, joint_names
 from sysid_btr.mujoco_conventions import free_joints, place_names
+from sysid_btr.units import after_number
 
 TIPPED = 0.5
 """Cosine of the angle between the base's and the world's vertical below which a robot has fallen."""
@@ -59,7 +61,7 @@ class Task(ABC):
     plausible : lowest and highest fitness that a real robot's trial can have.
     """
 
-    goal: ClassVar[str]
+    goal: ClassVar[str] = "fitness of the task"
     unit: ClassVar[str] = "1"
     plausible: ClassVar[tuple[float, float]] = (-np.inf, np.inf)
 
@@ -88,7 +90,7 @@ class Task(ABC):
 
     def in_words(self, fitness: float, digits: int = 4) -> str:
         """A fitness with its unit."""
-        return f"{fitness:.{digits}g}" + ("" if self.unit == "1" else f" {self.unit}")
+        return f"{fitness:.{digits}g}{after_number(self.unit, 0.0)}"
 
     def check(self, robot: Robot) -> None:
         """Whether a robot can do this at all.
@@ -197,19 +199,23 @@ class Track(Task):
         Raises
         ------
         LogError
-            If nothing moves in it.
+            If it is no single motion, shows a joint not all the time, or nothing moves in it.
         """
-        channel = "command" if log.joints("command") else "position"
-        joints = log.joints(channel)
-        task = cls(duration=float(log.time[-1] - log.time[0]), period=period, joints=joints)
-        at = log.time[0] + np.minimum(task.time, log.time[-1] - log.time[0])
-        if channel == "command":
-            wanted = command_at(log, joints, at)
-        else:
-            wanted = np.column_stack([np.interp(at, log.time, log.channels[f"position.{j}"]) for j in joints])
+        called, even = f"log {log.path or ''}", resample(log, period)
+        if len(log.episodes()) > 1:
+            raise LogError(
+                f"{called}: it holds {len(log.episodes())} episodes, and a trial has one motion; save one of them"
+            )
+        joints = log.joints("command") or log.joints("position")
+        wanted = command_at(log, joints, even.time) if log.joints("command") else even.array("position", joints)
+        unknown = [joint for k, joint in enumerate(joints) if not np.isfinite(wanted[:, k]).all()]
+        if unknown:
+            raise LogError(
+                f"{called}: {some(unknown)} has positions missing, or gaps, so that it shows no motion to track"
+            )
         if not joints or np.ptp(wanted, axis=0).max() == 0:
-            raise LogError(f"log {log.path or ''}: no joint moves in it, so that there is nothing to track")
-        return cls(task.duration, period, joints, wanted)
+            raise LogError(f"{called}: no joint moves in it, so that there is nothing to track")
+        return cls(period * (len(even) - 1), period, joints, wanted)
 
     @property
     def fingerprint(self) -> str:
@@ -226,6 +232,26 @@ class Track(Task):
         own = motion.position[:, :, [motion.joints.index(joint) for joint in self.joints]]
         error = np.sqrt(np.mean((own - self.wanted) ** 2, axis=(1, 2)))
         return np.asarray(1 - error / np.sqrt(np.mean((self.wanted - self.wanted[0]) ** 2)))
+
+
+def judged(task: Task, motion: Motion) -> tuple[FloatArray, BoolArray]:
+    """Fitness (m,) of motions, and whether each has fallen by each sample, (m, n).
+
+    A simulation that diverged has no fitness (NaN), whatever the task makes of it.
+
+    Raises
+    ------
+    UsageError
+        If a task fails, or does not give one fitness for each motion.
+    """
+    with blamed(f"task {type(task).__name__}"):
+        found, fallen = np.asarray(task.fitness(motion), dtype=np.float64), task.fallen(motion)
+    if found.shape != (len(motion.position),):
+        raise UsageError(
+            f"task {type(task).__name__}: its fitness of {len(motion.position)} motions has the shape {found.shape}; "
+            f"one number for each motion is wanted, ({len(motion.position)},)"
+        )
+    return np.where(np.isfinite(motion.position).all(axis=(1, 2)), found, np.nan), fallen
 
 
 def _base(motion: Motion) -> FloatArray:

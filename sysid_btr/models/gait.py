@@ -13,6 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import FloatArray
 from sysid_btr.errors import UsageError
+from sysid_btr.interpolation import smooth_step
 
 THIGH, KNEE_FORWARD, SHANK = 0.12, 0.005, 0.10
 """m, of the leg: knee below and in front of the hip, ankle below the knee."""
@@ -91,8 +92,7 @@ def gait(parameters: Gait, time: FloatArray) -> dict[str, FloatArray]:
     # a sinusoidal zero-moment point p needs a centre of mass y with p = y - y'' h / g
     amplitude = parameters.sway / (1 + frequency**2 * PENDULUM / GRAVITY)
     angle = frequency * np.maximum(time - SETTLE, 0.0)
-    fade = np.clip((time - SETTLE) / (1.5 * parameters.period), 0.0, 1.0)
-    fade = fade * fade * (3 - 2 * fade)
+    fade = smooth_step((time - SETTLE) / (1.5 * parameters.period))
     sideways = fade * amplitude * np.sin(angle)
     # how far a foot is through its stance (0 at landing, 1 at lift-off) or swing, from the phase of the sway
     commands = {name: np.full(len(time), value) for name, value in ARMS.items()}

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import FloatArray, IntArray
+from sysid_btr.interpolation import clamped_knots
 from sysid_btr.terms.base import BatchModel, Kind, Outputs, Parameter, Scope
 from sysid_btr.terms.effect import COMMANDS, Effect, Probe
 from sysid_btr.terms.law import Step, drive, used_in_laws
@@ -51,8 +52,7 @@ def smooth_modes() -> BSpline:
     from scipy.interpolate import BSpline
     from scipy.linalg import eigh
 
-    inner = np.linspace(0.0, 1.0, SPLINES - DEGREE + 1)
-    knots = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
+    knots = clamped_knots(SPLINES, DEGREE)
     splines = BSpline(knots, np.eye(SPLINES), DEGREE)
     even, bent = splines(EVEN), splines(EVEN, nu=2)
     gram = even.T @ even / len(even)
