@@ -247,8 +247,8 @@ def test_the_ground_presses_on_the_lowest_points_of_a_foot(tilt: float) -> None:
     turn = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
     (reach,) = chain_module.pressed((sole @ turn.T)[None], NAO)
     middle = turn @ [length if tilt else 0.0, 0.0, -height]
-    force = np.array([3.0, -2.0, 40.0])
-    pushed = reach @ np.append(force / NAO.weight, np.zeros(3))
+    force = np.array([0.1, -0.05, 1.0])
+    pushed = reach @ np.append(force, np.zeros(3))
     np.testing.assert_allclose(pushed, np.append(force, np.cross(middle, force)), atol=1e-9)
     beside = np.hypot(width if tilt else np.hypot(length, width), chain_module.BESIDE)
-    np.testing.assert_allclose(reach[3:, 3:], NAO.weight * beside * np.eye(3), rtol=1e-6)
+    np.testing.assert_allclose(reach[3:, 3:], beside * np.eye(3), rtol=1e-6)

@@ -68,8 +68,8 @@ NUDGE = (0.01, 0.001, 0.01, 0.01, 0.001, 0.1)
 """Changes of the same, either way, by which derivatives are taken: about as large as what is not known of them, so
 that a joint which sticks or slips within it has the slope that serves both (statistical linearisation: Garcia-Fernandez
 et al. 2017, doi:10.1109/TAC.2016.2592681)."""
-NUDGE_FORCE, NUDGE_TORQUE = 5.0, 0.5
-"""... and of forces, N, and torques, Nm."""
+NUDGE_FORCE, NUDGE_TORQUE = 0.12, 0.012
+"""... and of forces and torques, m, over the weight."""
 SMALL = 0.1
 """... where nothing sticks: fractions of these, so that what bends within them does not count."""
 STRETCH, SHOWING = 4.0, 800
@@ -100,7 +100,8 @@ class SampleSteps(FloatingReplay):
 
     Attributes
     ----------
-    wrench : (w, f, 6) force (N) and torque (Nm), in the world's axes, on the centre of mass of each foot.
+    wrench : (w, f, 6) force and torque (m), in the world's axes, on the centre of mass of each foot, over the weight
+        that the candidate has: what is heavier is borne by more, in the same place.
     late : steps of the integrator by which commands come later than the log has them.
     friction : (j,) dry friction, Nm, of joints while they may stand still, whatever candidates say: a joint that stands
         holds any torque up to it, and does not show it. None: that of the candidate, always.
@@ -135,13 +136,13 @@ class SampleSteps(FloatingReplay):
         """Bodies that touch the ground."""
         return [self.model.body(foot.name).id for foot in touching_bodies(self.model)]
 
-    def push(self, segment: IntArray, change: FloatArray | None) -> Fields:
+    def push(self, batch: BatchModel, segment: IntArray, change: FloatArray | None) -> Fields:
         assert self.wrench is not None
         wrench = self.wrench[segment]
         if change is not None:
             wrench = wrench + change[:, -wrench[0].size :].reshape(wrench.shape)
         pushed = np.zeros((len(segment), self.model.nbody, 6))
-        pushed[:, self.feet] = wrench
+        pushed[:, self.feet] = wrench * weights(batch)[:, None, None]
         return {"xfrc_applied": pushed}
 
     @property
@@ -183,11 +184,17 @@ class SampleSteps(FloatingReplay):
         return Segments(rows, q, dq, std, BaseStates(base[:, :3], base[:, 3:7], base[:, 7:10], base[:, 10:]))
 
 
+def weights(batch: BatchModel) -> FloatArray:
+    """(m,) N, of the robot under each candidate."""
+    gravity = float(np.linalg.norm(batch.model.opt.gravity))
+    return np.asarray(gravity * batch.read("body_mass").sum(axis=1))
+
+
 @dataclass(frozen=True, eq=False)
 class Derivatives:
     """Of the end of each step: by its start (w, d, d), by the mean wrench and by blows at its start and its end.
 
-    These are (w, d, 6 f) each; those of blows on the joints at its start are (w, d, j).
+    Forces and blows on the feet are over the robot's weight. These are (w, d, 6 f) each; those of blows on the joints at its start are (w, d, j).
     """
 
     start: FloatArray
@@ -224,8 +231,9 @@ class Chain:
     time : (n,) s since the first sample.
     size : of the robot.
     jolt, slack : one of `JOLTS`, and factor on `SLACK`, one of `SLACKS`.
-    reach : (n - 1, f, 6, 6) force and torque on a foot's centre of mass by a force in the middle of where it may touch,
-        of one weight, and by the torque that this has as the ground may press beside that: standard deviations.
+    reach : (n - 1, f, 6, 6) force and torque (m) on a foot's centre of mass, over the weight, by a force in the middle of
+        where it may touch, of one weight, and by the torque that this has as the ground may press beside that: standard
+        deviations.
     held : (j,) size, Nms, of the unknown blow in a step in which a joint may stand still; None where nothing rubs.
     """
 
@@ -398,7 +406,7 @@ def pressed(arm: FloatArray, size: BodySize) -> FloatArray:
     result[:, [0, 1, 2], [0, 1, 2]] = 1.0
     result[:, 3:, :3] = np.cross(middle[:, None], np.eye(3)).transpose(0, 2, 1)
     result[:, [3, 4, 5], [3, 4, 5]] = np.sqrt(spread + size.length(BESIDE) ** 2)[:, None]
-    return size.weight * result
+    return result
 
 
 def _touching(low: FloatArray, load: FloatArray | None, size: BodySize) -> BoolArray:
@@ -478,8 +486,7 @@ def _felt(chain: Chain) -> IntArray:
 
 def _nudged_forces(chain: Chain) -> FloatArray:
     """(6 f,) changes of forces and torques by which derivatives are taken."""
-    kinds = [NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3
-    return np.asarray(chain.size.force(1.0) * np.tile(kinds, chain.touch.shape[1]))
+    return np.tile([NUDGE_FORCE] * 3 + [chain.size.length(NUDGE_TORQUE)] * 3, chain.touch.shape[1])
 
 
 def _responses(chain: Chain, steps: SampleSteps, values: FloatArray, which: IntArray, up: FloatArray) -> FloatArray:
@@ -532,11 +539,13 @@ def derivative_step(period: float, size: BodySize) -> float:
 
 
 def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
-    """Change of the states at some samples under unit blows (Ns, Nms) on the feet and the joints, (k, d, 6 f + j)."""
+    """Change of the states at some samples under unit blows, (k, d, 6 f + j): on the feet, over the weight, and on the
+    joints, Nms."""
     import mujoco
 
     steps, states = chain.steps, chain.states
-    model, index = _written(steps, values).candidate(0), steps.index
+    batch = _written(steps, values)
+    model, index = batch.candidate(0), steps.index
     data = mujoco.MjData(model)
     place, motion = free_addresses(steps.model)
     order = np.concatenate([motion + np.arange(6), index.dof])
@@ -544,6 +553,7 @@ def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
     rows = np.concatenate([np.arange(6, BASE), BASE + joints + np.arange(joints)])
     where = np.zeros((6 * len(steps.feet) + joints, model.nv))
     where[6 * len(steps.feet) + np.arange(joints), index.dof] = 1.0
+    unit = np.repeat([float(weights(batch)[0]), 1.0], [6 * len(steps.feet), joints])
     jacobian, blow = where[: 6 * len(steps.feet)].reshape(-1, 6, model.nv), np.zeros_like(where)
     result = np.zeros((len(samples), states.std.shape[1], len(blow)))
     for own_result, k in zip(result, samples, strict=True):
@@ -554,7 +564,7 @@ def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
         for own, body in zip(jacobian, steps.feet, strict=True):
             mujoco.mj_jacBodyCom(model, data, own[:3], own[3:], body)
         mujoco.mj_solveM(model, data, blow, where)
-        own_result[rows] = blow.T[order]
+        own_result[rows] = blow.T[order] * unit
     return result
 
 

@@ -112,7 +112,8 @@ class Filter:
     ----------
     states : (n) about which it is linearised: what all samples leave most probable.
     filtered : (n) what each sample and those before it leave most probable, from which the next one is predicted.
-    wrench : (n - 1, f, 6) mean forces on the feet of which the same is true, with the sample at their end.
+    wrench : (n - 1, f, 6) mean forces on the feet, over the weight, of which the same is true, with the sample at their
+        end.
     linked : (n - 1,) steps that are replayed; after another one it begins anew.
     carry, push : (n - 1, d, d), (n - 1, d) error of the state that is expected of the next sample, from that of this
         one, and from what this one measures.

@@ -45,10 +45,6 @@ class BodySize:
         """m/s2, of what is `nao` m/s2 on the Nao."""
         return nao * (self.gravity / NAO.gravity)
 
-    def force(self, nao: float) -> float:
-        """N, of what is `nao` N on the Nao."""
-        return nao * (self.weight / NAO.weight)
-
     def time(self, nao: float) -> float:
         """s, of what is `nao` s on the Nao."""
         return nao * float(np.sqrt(self.length(1.0) / self.acceleration(1.0)))

@@ -336,7 +336,7 @@ class SegmentReplay(Replay):
         )
         if starts.base is not None:
             place_base(setup, starts.base)
-        return replace(setup, state={**setup.state, **self.push(segment, change)})
+        return replace(setup, state={**setup.state, **self.push(batch, segment, change)})
 
     def lanes(self) -> list[list[tuple[int, IntArray]]]:
         """Numbers of a start that one simulation can vary together: (position in `Segments.std`, joints it moves).
@@ -353,6 +353,6 @@ class SegmentReplay(Replay):
             lanes += [[(j, seen) for j, seen in own], [(len(joints) + j, seen) for j, seen in own]]
         return lanes
 
-    def push(self, segment: IntArray, change: FloatArray | None) -> Fields:
+    def push(self, batch: BatchModel, segment: IntArray, change: FloatArray | None) -> Fields:
         """Forces from outside on a batch of segments, as in MjData; none here."""
         return {}
