@@ -227,6 +227,28 @@ def test_a_model_that_lacks_something_else_is_contradicted() -> None:
     assert without_ground(problem, begin) is None
 
 
+def test_what_weighs_and_drives_more_alike_moves_alike(on_springs: OnSprings) -> None:
+    """Positions tell ratios of masses, gains, drag and rotor inertia: the ground bears what a candidate weighs."""
+    study = on_springs[1]
+    terms = study.declare([f"{name}:*=shared" for name in ("mass", "kp", "kv", "armature", "damping")])
+    replay = study.train_problem(terms).episodes[0].replay
+    assert isinstance(replay, FloatingReplay)
+    chain = chain_module.chain_of(replay)
+    own = terms.nominal
+    assert own.min() > 0
+    every = np.arange(len(chain.touch))
+
+    def ends(values: np.ndarray) -> Segments:
+        return chain.steps.ends(values[None], np.zeros(len(every), dtype=np.int64), every, None)
+
+    np.testing.assert_allclose(difference(ends(1.4 * own), ends(own)), 0.0, atol=1e-9)
+    heavier = np.where(np.arange(len(own)) == 0, 1.4 * own, own)
+    assert np.abs(difference(ends(heavier), ends(own))).max() > 1e-3
+    one, other = (chain_module.derive(chain, values) for values in (own, 1.4 * own))
+    for field in ("start", "mean", "blow", "last"):
+        np.testing.assert_allclose(getattr(one, field), getattr(other, field), rtol=1e-6, atol=1e-8)
+
+
 def test_logs_that_do_not_suit_are_left_alone(on_springs: OnSprings) -> None:
     replay = on_springs[2].episodes[0].replay
     assert isinstance(replay, FloatingReplay)

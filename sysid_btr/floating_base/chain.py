@@ -194,7 +194,8 @@ def weights(batch: BatchModel) -> FloatArray:
 class Derivatives:
     """Of the end of each step: by its start (w, d, d), by the mean wrench and by blows at its start and its end.
 
-    Forces and blows on the feet are over the robot's weight. These are (w, d, 6 f) each; those of blows on the joints at its start are (w, d, j).
+    These are (w, d, 6 f) each, by forces and blows over the robot's weight; those of blows on the joints at its start
+    are (w, d, j).
     """
 
     start: FloatArray
@@ -231,9 +232,9 @@ class Chain:
     time : (n,) s since the first sample.
     size : of the robot.
     jolt, slack : one of `JOLTS`, and factor on `SLACK`, one of `SLACKS`.
-    reach : (n - 1, f, 6, 6) force and torque (m) on a foot's centre of mass, over the weight, by a force in the middle of
-        where it may touch, of one weight, and by the torque that this has as the ground may press beside that: standard
-        deviations.
+    reach : (n - 1, f, 6, 6) force and torque (m) on a foot's centre of mass, over the weight, by a force in the middle
+        of where it may touch, of one weight, and by the torque that this has as the ground may press beside that:
+        standard deviations.
     held : (j,) size, Nms, of the unknown blow in a step in which a joint may stand still; None where nothing rubs.
     """
 
@@ -539,8 +540,10 @@ def derivative_step(period: float, size: BodySize) -> float:
 
 
 def _blows(chain: Chain, values: FloatArray, samples: IntArray) -> FloatArray:
-    """Change of the states at some samples under unit blows, (k, d, 6 f + j): on the feet, over the weight, and on the
-    joints, Nms."""
+    """Change of the states at some samples under unit blows on the feet (over the weight) and the joints (Nms).
+
+    It is (k, d, 6 f + j).
+    """
     import mujoco
 
     steps, states = chain.steps, chain.states

@@ -22,7 +22,7 @@ from sysid_btr.simulation.replay import CHUNK_DOFS, Replay
 from sysid_btr.simulation.setup import Setup, Values, prepare
 from sysid_btr.simulation.start import behind_sensors
 from sysid_btr.simulation.subtrees import subtrees
-from sysid_btr.terms.base import Fields, Outputs
+from sysid_btr.terms.base import BatchModel, Fields, Outputs
 
 if TYPE_CHECKING:
     from sysid_btr.io.log import Log
