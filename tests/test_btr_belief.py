@@ -111,3 +111,18 @@ def test_what_carries_most_may_have_its_centre_a_little_off(name: str) -> None:
     assert along == {0.01 * measure_size(robot.model).length(1.0)}
     declared = parse_parameters([f"com_offset:{moved.places[0]}"], robot)
     assert "com_offset" not in {term.name for term in Belief.unmeasured(robot, declared)[0]}
+
+
+def test_rotor_inertia_and_damping_are_as_uncertain_as_models_are_unless_they_are_declared() -> None:
+    nao = load_robot("nao")
+
+    def asked(*declared: str) -> dict[str, tuple[str, ...]]:
+        terms = Belief.unmeasured(nao, parse_parameters(list(declared), nao))[0]
+        return {term.name: term.places for term in terms if term.name.endswith("_factor")}
+
+    assert asked("mass:*").keys() == {"armature_factor", "damping_factor"}
+    # a factor of nothing is nothing
+    has = nao.model.dof_armature > 0
+    assert len(asked()["armature_factor"]) == int(has.sum())
+    assert asked("armature:*").keys() == {"damping_factor"}
+    assert asked("viscous_damping:*=shared", "armature_factor:*") == {}

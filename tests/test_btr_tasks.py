@@ -280,7 +280,8 @@ def test_a_motion_is_followed_better_once_it_is_fed_forward() -> None:
 
 
 def test_an_arm_has_no_ground() -> None:
-    assert {term.name for term in Belief.unmeasured(LEG, ())[0]} == {"coulomb_friction", "command_delay"}
+    asked = {"coulomb_friction", "command_delay", "armature_factor", "damping_factor"}
+    assert {term.name for term in Belief.unmeasured(LEG, ())[0]} == asked
 
 
 def test_runs_are_the_same_whatever_is_beside_them() -> None:

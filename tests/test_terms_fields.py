@@ -60,6 +60,8 @@ CASES: dict[str, tuple[str, list[float], Callable[[Any], None]]] = {
     "quadratic_damping": ("quadratic_damping:knee", [0.04], lambda s: set_joint(s, "damping", [0.05, 0.04, 0])),
     "frictionloss": ("frictionloss:knee", [0.2], lambda s: set_joint(s, "frictionloss", 0.2)),
     "armature": ("armature:knee", [0.02], lambda s: set_joint(s, "armature", 0.02)),
+    "damping_factor": ("damping_factor:knee", [2.4], lambda s: set_joint(s, "damping", [0.12, 0, 0])),
+    "armature_factor": ("armature_factor:knee", [0.4], lambda s: set_joint(s, "armature", 0.0024)),
     "stiffness": ("stiffness:knee", [1.7], lambda s: set_joint(s, "stiffness", [1.7, 0, 0])),
     "kp": ("kp:knee", [0.7], lambda s: scale_kp(s, 0.7)),
     "kv": ("kv:knee", [2.1], lambda s: scale_kv(s, 2.1)),

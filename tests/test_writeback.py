@@ -274,6 +274,11 @@ CHANGES: dict[str, tuple[list[str], list[float], set[str]]] = {
     "damping": (["damping:*"], [0.02, 0.07, 0.0], {"dof_damping"}),
     "quadratic damping": (["quadratic_damping:hip,knee"], [0.02, 0.0], {"dof_dampingpoly"}),
     "armature": (["armature:knee"], [0.011], {"dof_armature"}),
+    "factors of both": (
+        ["damping_factor:hip", "armature_factor:*=shared"],
+        [0.4, 1.3],
+        {"dof_damping", "dof_armature"},
+    ),
     "stiffness": (["stiffness:*"], [0.5, 0.6, 0.7], {"jnt_stiffness"}),
     "force limit": (["force_limit:hip"], [1.5], {"actuator_forcerange", "actuator_forcelimited"}),
     "friction of contacts": (["foot_friction:ankle"], [0.6], {"geom_friction"}),

@@ -12,7 +12,7 @@ from sysid_btr.floating_base.size import measure_size
 from sysid_btr.models.robot import Robot, servo_drives
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.terms.base import Parameter, Term
-from sysid_btr.terms.effect import GROUND, Effect
+from sysid_btr.terms.effect import GROUND, DofEffect, Effect
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
@@ -23,6 +23,8 @@ UNMEASURED: Mapping[str, float] = {
     "command_delay": 0.02,
     DRY: 0.01,
     LOADED: 0.01,
+    "armature_factor": 0.3,
+    "damping_factor": 0.6,
 }
 """What no trial measures by itself, or nobody declares: effect -> standard deviation about its neutral value.
 
@@ -30,6 +32,8 @@ A ground is as soft as nobody knows; grass, carpet and tiles under rubber differ
 and a servo's own cycle take a few periods of 10 to 20 ms; and gears rub, so that servos stop half a degree off (rad:
 times their stiffness, that is a torque). Cables, batteries and loads leave the centre of what carries most a centimetre
 off, on a robot of the Nao's size (m): whether a gait falls depends on it, and a mass that is learnt says nothing of it.
+Positions tell ratios of all that makes torque: rotor inertia and damping, taken as exact, would tell how large the masses
+and gains are to a few percent (`Kind.spread` of both has the sources).
 """
 WIDTH = 2.0
 """Standard deviation of a parameter before anything is known, in changes that matter (`Parameter.scale`)."""
@@ -86,10 +90,12 @@ class Belief:
         ground : whether the ground is asked for, too.
         """
         there = {term.name for term in terms}
+        written = {term.compiled for term in terms if isinstance(term, DofEffect)}
         found: list[Term] = []
         for effect in select_effects([name for name in UNMEASURED if name not in there] or ["all"]):
             places = _places(robot, effect, ground)
-            if effect.name in UNMEASURED and not effect.variant and effect.name not in there and places:
+            known = effect.name in there or (issubclass(effect, DofEffect) and effect.compiled in written)
+            if effect.name in UNMEASURED and not effect.variant and not known and places:
                 found.append(effect(places=places, shared=len(places) > 1))
         sized = {DRY: _stiffness, LOADED: _length}
         std = [UNMEASURED[term.name] * sized.get(term.name, lambda _: 1.0)(robot) for term in found]
@@ -168,6 +174,8 @@ def _places(robot: Robot, effect: type[Effect], ground: bool) -> tuple[str, ...]
     floats = len(free_joints(robot.model)) > 0
     if effect.needs == GROUND and not (ground and floats):
         return ()
+    if issubclass(effect, DofEffect) and effect.kinds[0].unit == "1":  # a factor, of what there is
+        return tuple(j for j in robot.names(effect.scope) if effect.own_value(robot.model, j) > 0)
     if effect.name != LOADED:
         return robot.names(effect.scope)
     heaviest = int(np.argmax(robot.model.body_mass))

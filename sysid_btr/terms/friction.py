@@ -85,6 +85,29 @@ class ViscousDamping(Damping):
 
 
 @dataclass(frozen=True)
+class DampingFactor(Damping):
+    """Viscous damping as a factor of what the model has.
+
+    Native: `dof_damping`. Robots have it from their models' by six tenths, as a factor drawn evenly in its logarithm
+    from 0.3 to 3 (Andrychowicz et al. 2020, doi:10.1177/0278364919887447).
+    """
+
+    name: ClassVar[str] = "damping_factor"
+    family: ClassVar[str] = "friction"
+    compiled: ClassVar[str] = "dof_damping"
+    title: ClassVar[str] = "a change of the damping"
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("kv", "a logged effort or current; the two are confounded in positions alone"),
+    )
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.0, 10.0, 0.1, spread=0.6),)
+
+    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
+        return present * values
+
+
+@dataclass(frozen=True)
 class QuadraticDamping(Damping):
     """Quadratic damping: a torque proportional to velocity times speed, against it.
 

@@ -99,6 +99,29 @@ class Armature(DofEffect):
         return (Kind("inertia", "kg m2", 0.0, 0.0, 5 * scale.inertia, 0.05 * scale.inertia),)
 
 
+@dataclass(frozen=True)
+class ArmatureFactor(DofEffect):
+    """Rotor inertia as a factor of what the model has.
+
+    Native: `dof_armature`. Robots have it from their models' by three tenths: inertia is randomised by 0.5 to 1.5 (Tan
+    et al. 2018, doi:10.15607/RSS.2018.XIV.010).
+    """
+
+    name: ClassVar[str] = "armature_factor"
+    family: ClassVar[str] = "inertia"
+    compiled: ClassVar[str] = "dof_armature"
+    title: ClassVar[str] = "a change of the rotor inertia"
+    usual: ClassVar[bool] = False
+    signed: ClassVar[bool] = True
+    confounders: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("kp", "masses that are known: positions tell ratios of masses, gains and rotor inertia alone"),
+    )
+    kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.1, 10.0, 0.1, spread=0.3),)
+
+    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
+        return present * values
+
+
 ARM = 0.05
 """Distance, m, of a load whose mass a scan cannot distinguish from its place."""
 

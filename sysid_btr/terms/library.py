@@ -22,6 +22,7 @@ from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.free_form import FREE_FORMS, FreeGainOfAll, FreeGainStiffness
 from sysid_btr.terms.friction import (
     CoulombFriction,
+    DampingFactor,
     LoadFriction,
     LoadFrictionLarger,
     LoadFrictionPower,
@@ -31,7 +32,7 @@ from sysid_btr.terms.friction import (
     StribeckFriction,
     ViscousDamping,
 )
-from sysid_btr.terms.inertial import Armature, ComOffset, GravityTilt, Inertia, Mass, Payload
+from sysid_btr.terms.inertial import Armature, ArmatureFactor, ComOffset, GravityTilt, Inertia, Mass, Payload
 from sysid_btr.terms.initial_state import StartPosition, StartVelocity
 from sysid_btr.terms.limits import SlewLimit, SpeedTorqueLimit, TorqueLimit, TorqueLimitSoft
 from sysid_btr.terms.power import ThermalDerating, VoltageSag, VoltageSagLoad, VoltageSagLoadStiffness
@@ -76,6 +77,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     TorqueConstant,
     CoulombFriction,
     ViscousDamping,
+    DampingFactor,
     QuadraticDamping,
     StribeckFriction,
     PreslidingFriction,
@@ -85,6 +87,7 @@ BUILT_IN: tuple[type[Term], ...] = (
     LoadFrictionStribeck,
     BackEmf,
     Armature,
+    ArmatureFactor,
     CommandDelay,
     CommandDelaySampled,
     ActuatorFilter,
