@@ -32,7 +32,7 @@ A ground is as soft as nobody knows; grass, carpet and tiles under rubber differ
 and a servo's own cycle take a few periods of 10 to 20 ms; and gears rub, so that servos stop half a degree off (rad:
 times their stiffness, that is a torque). Cables, batteries and loads leave the centre of what carries most a centimetre
 off, on a robot of the Nao's size (m): whether a gait falls depends on it, and a mass that is learnt says nothing of it.
-Positions tell ratios of all that makes torque: rotor inertia and damping, taken as exact, would tell how large the masses
+Positions tell ratios of all that makes torque: rotor inertia and damping, taken as exact, would tell how large masses
 and gains are to a few percent (`Kind.spread` of both has the sources).
 """
 WIDTH = 2.0
