@@ -22,7 +22,7 @@ from typing import Any
 
 from benchmarks.gantry import data_folder
 from sysid_btr.diagnosis.close import close
-from sysid_btr.floating_base.episode import reconstruct
+from sysid_btr.floating_base.reconstruction import reconstruct
 from sysid_btr.identify.fit import fit
 from sysid_btr.identify.study import make_study
 from sysid_btr.io.parquet import read_log

@@ -19,8 +19,9 @@ from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.estimators.lsq import LeastSquares
 from sysid_btr.floating_base import segments as segments_module
 from sysid_btr.floating_base.contact_free import without_ground
-from sysid_btr.floating_base.episode import FloatingEpisode, reconstruct
+from sysid_btr.floating_base.episode import FloatingEpisode
 from sysid_btr.floating_base.estimate import BaseState
+from sysid_btr.floating_base.reconstruction import reconstruct
 from sysid_btr.floating_base.segments import FloatingReplay, SegmentLength, segment_best, segment_log
 from sysid_btr.floating_base.size import measure_size
 from sysid_btr.floating_base.strides import of_legs, repeated_error, stride

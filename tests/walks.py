@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sysid_btr.floating_base import contact_free, orientation
+from sysid_btr.floating_base import innovations, orientation
 from sysid_btr.io.log import Log, LogMeta
 from sysid_btr.models.builtin import load_robot
 from sysid_btr.models.gait import Gait, gait
@@ -193,7 +193,7 @@ class Scale:
         """Sensors and a bus that are worse by as much as everything is slower: theirs are not the robot's times."""
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(orientation, "DRIFT", orientation.DRIFT / np.sqrt(self.time))
-            patch.setattr(contact_free, "LATE", contact_free.LATE * self.time)
+            patch.setattr(innovations, "LATE", innovations.LATE * self.time)
             yield
 
     def log(self, log: Log) -> Log:

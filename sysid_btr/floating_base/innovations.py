@@ -46,8 +46,8 @@ from sysid_btr.floating_base.chain import (
     unexplained,
     with_friction,
 )
-from sysid_btr.floating_base.episode import MOST_WALKED, reconstruct
 from sysid_btr.floating_base.estimate import BaseState
+from sysid_btr.floating_base.reconstruction import MOST_WALKED, reconstruct
 from sysid_btr.floating_base.segments import FloatingReplay
 from sysid_btr.identify.episode import Episode, Procedure
 from sysid_btr.io.log import Log

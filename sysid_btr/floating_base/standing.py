@@ -14,10 +14,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray
-from sysid_btr.floating_base.episode import reconstruct
 from sysid_btr.floating_base.estimate import BaseState
 from sysid_btr.floating_base.events import find_fall
 from sysid_btr.floating_base.orientation import tilt_of
+from sysid_btr.floating_base.reconstruction import reconstruct
 from sysid_btr.floating_base.segments import FASTEST, whole_step
 from sysid_btr.identify.episode import ROUGH_STEP, E, FixedEpisode, Procedure
 from sysid_btr.identify.horizon import is_held
