@@ -190,7 +190,7 @@ def test_the_likeliest_slack_and_jolts_are_found_from_afar(start: tuple[float, f
     known = chain_module.derive(chain, values)
     ends = chain_module.simulate_chain(chain, values, np.arange(0), np.zeros(0))
     found = chain_module.linearise_chain(chain, known, ends)
-    chain = chain_module.moved_chain(chain, known, found, np.zeros(1))
+    chain = chain_module.moved_chain(chain, known, found)
     free = np.arange(2)
     ends = chain_module.simulate_chain(chain, values, free, 0.02 * (problem.upper - problem.lower)[free])
 

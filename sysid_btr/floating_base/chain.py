@@ -24,7 +24,6 @@ from sysid_btr.floating_base.size import BodySize
 from sysid_btr.io.log import Log
 from sysid_btr.io.noise import noise_floor
 from sysid_btr.mujoco_conventions import to_rotation
-from sysid_btr.objectives.problem import BLOCK
 from sysid_btr.simulation.base_states import BASE, BaseStates, free_addresses
 from sysid_btr.simulation.compiling import compile_model, make_index
 from sysid_btr.simulation.grid import Grid
@@ -296,14 +295,12 @@ class Round:
     Attributes
     ----------
     left : (r, 1 + p) whitened residuals for the numbers as they are, and their derivatives.
-    blocks : (r,) stretch of time of each.
     surprise : minus twice the log likelihood, states and forces integrated out.
-    move : (n d, 1 + p) what the states do, for the numbers as they are and for a unit of each.
+    move : (n d,) what the states do.
     ends : from which this was made.
     """
 
     left: FloatArray
-    blocks: IntArray
     surprise: float
     move: FloatArray
     ends: Ends
@@ -656,7 +653,7 @@ def linearise_chain(chain: Chain, known: Derivatives, ends: Ends) -> Round:
     )
     linked = chain.linked[:, None, None]
     right = np.where(linked, right, 0.0)
-    failed = Round(np.zeros((1, 1 + p)), np.zeros(1, dtype=np.int64), np.inf, np.zeros((n * d, 1 + p)), ends)
+    failed = Round(np.zeros((1, 1 + p)), np.inf, np.zeros(n * d), ends)
     if not np.isfinite(right).all():  # a simulation failed
         return failed
     try:
@@ -685,9 +682,7 @@ def linearise_chain(chain: Chain, known: Derivatives, ends: Ends) -> Round:
     left = np.concatenate([part.reshape(-1, 1 + p) for part in (missed, stated, kept)])
     volume = np.log(np.diagonal(factor, axis1=1, axis2=2))[chain.linked].sum() + np.log(band[0]).sum()
     surprise = float(left[:, 0] @ left[:, 0]) + 2 * float(volume)
-    stretch = (chain.time / chain.size.time(BLOCK)).astype(np.int64)
-    blocks = np.concatenate([np.repeat(stretch[:w], d), np.repeat(stretch, stated.shape[1]), np.repeat(stretch, d)])
-    return Round(left, blocks, surprise, solved, ends)
+    return Round(left, surprise, solved[:, 0], ends)
 
 
 def unexplained(chain: Chain, known: Derivatives) -> tuple[FloatArray, FloatArray]:
@@ -751,12 +746,11 @@ def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     return band.reshape(2 * d, n * d)
 
 
-def moved_chain(chain: Chain, known: Derivatives, found: Round, change: FloatArray) -> Chain:
-    """A chain with its states, and the mean forces in its steps, where they are best after a change of the numbers."""
+def moved_chain(chain: Chain, known: Derivatives, found: Round) -> Chain:
+    """A chain with its states, and the mean forces in its steps, where they are best."""
     n, d = chain.states.std.shape
-    move = -(found.move[:, 0] + found.move[:, 1:] @ change).reshape(n, d)
+    move = -found.move.reshape(n, d)
     rest = found.ends.defect + np.einsum("nij,nj->ni", known.start, move[:-1]) - move[1:]
-    rest = rest + found.ends.by_number @ change
     # least-norm forces, each in its own size, that explain what the steps leave open
     forces, total = unexplained(chain, known)
     linked = chain.linked[:, None, None]

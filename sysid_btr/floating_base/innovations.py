@@ -532,7 +532,7 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
         found = linearise_chain(chain, known, ends)
         if not np.isfinite(found.surprise):
             break
-        chain = moved_chain(chain, known, found, np.zeros(ends.by_number.shape[2]))
+        chain = moved_chain(chain, known, found)
         # they hardly depend on numbers or states, but where joints stick and slip they do
         old = stale(chain, known, values, k)
         if old.any():
