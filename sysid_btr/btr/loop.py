@@ -484,8 +484,7 @@ def disengaged(rounds: Sequence[Iteration]) -> str:
     return (
         f"Disengaged: nothing better was found on the robot in {PATIENCE} iterations, and the model does not "
         f"predict which controller is better there (rank correlation {correlation:.2f} over {len(tried)} trials). "
-        "The model lacks something that the robot has: declare other parameters, or search for missing effects "
-        "(--close)."
+        "The model lacks something that the robot has, which was not found: declare other parameters (--fit)."
     )
 
 

@@ -127,7 +127,11 @@ class BtrOptions(ModelOptions, ParameterOptions, SeedOptions, ThreadOptions, Out
         decides=True,
     )
     requirement: float | None = option(None, "Stop once the robot does it this well.", metavar="FITNESS", decides=False)
-    close: bool = option(False, "Look for missing effects where no model explains the robot's logs.", decides=True)
+    close: bool = option(
+        True,
+        "Look for missing effects, once, where no model explains the robot's logs: minutes, on two cores.",
+        decides=True,
+    )
 
 
 def btr(options: BtrOptions) -> int:

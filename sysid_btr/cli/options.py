@@ -71,7 +71,8 @@ class Option:
         else:
             words = f"{self.help} Repeatable." if self.repeatable else self.help
             words += f" [default: {self.otherwise}]" if self.otherwise else ""
-            names = [self.flag, self.short] if self.short else [self.flag]
+            switch = f"{self.flag}/--no-{self.flag[2:]}" if self.default is True else self.flag
+            names = [switch, self.short] if self.short else [switch]
             how = typer.Option(
                 *names, metavar=self.metavar, min=self.least, help=words, show_default=not self.otherwise
             )
