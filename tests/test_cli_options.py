@@ -137,7 +137,7 @@ def test_the_fingerprint_covers_all_that_decides_which_candidates_are_evaluated(
     one = options_of(kind)[name]
     robot = load_robot(MODEL)
     plain = kind(model=MODEL)  # type: ignore[call-arg]
-    value = EXAMPLES[kind_of(one.kind)][0]
+    value = not one.default if isinstance(one.default, bool) else EXAMPLES[kind_of(one.kind)][0]
     other = replace(plain, **{name: value})
     assert getattr(other, name) != getattr(plain, name)
     if name == "model":  # it is known by its content
