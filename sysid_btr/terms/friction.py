@@ -88,8 +88,8 @@ class ViscousDamping(Damping):
 class DampingFactor(Damping):
     """Viscous damping as a factor of what the model has.
 
-    Native: `dof_damping`. Robots have it from their models' by six tenths, as a factor drawn evenly in its logarithm
-    from 0.3 to 3 (Andrychowicz et al. 2020, doi:10.1177/0278364919887447).
+    Native: `dof_damping`. Robots are taken to have it from their models' by six tenths, as where it is drawn evenly in
+    its logarithm from 0.3 to 3 (Andrychowicz et al. 2020, doi:10.1177/0278364919887447).
     """
 
     name: ClassVar[str] = "damping_factor"

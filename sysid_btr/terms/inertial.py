@@ -103,8 +103,8 @@ class Armature(DofEffect):
 class ArmatureFactor(DofEffect):
     """Rotor inertia as a factor of what the model has.
 
-    Native: `dof_armature`. Robots have it from their models' by three tenths: inertia is randomised by 0.5 to 1.5 (Tan
-    et al. 2018, doi:10.15607/RSS.2018.XIV.010).
+    Native: `dof_armature`. Robots are taken to have it from their models' by three tenths, as the inertia of links is
+    randomised, evenly from 0.5 to 1.5 (Tan et al. 2018, doi:10.15607/RSS.2018.XIV.010).
     """
 
     name: ClassVar[str] = "armature_factor"
