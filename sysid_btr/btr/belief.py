@@ -13,6 +13,8 @@ from sysid_btr.models.robot import Robot, servo_drives
 from sysid_btr.mujoco_conventions import free_joints
 from sysid_btr.terms.base import Parameter, Term
 from sysid_btr.terms.effect import GROUND, DofEffect, Effect
+from sysid_btr.terms.friction import DampingFactor
+from sysid_btr.terms.inertial import ArmatureFactor
 from sysid_btr.terms.library import select_effects
 from sysid_btr.terms.model import Terms
 
@@ -23,8 +25,8 @@ UNMEASURED: Mapping[str, float] = {
     "command_delay": 0.02,
     DRY: 0.01,
     LOADED: 0.01,
-    "armature_factor": 0.3,
-    "damping_factor": 0.6,
+    ArmatureFactor.name: ArmatureFactor.kinds[0].spread,
+    DampingFactor.name: DampingFactor.kinds[0].spread,
 }
 """What no trial measures by itself, or nobody declares: effect -> standard deviation about its neutral value.
 
@@ -33,7 +35,7 @@ and a servo's own cycle take a few periods of 10 to 20 ms; and gears rub, so tha
 times their stiffness, that is a torque). Cables, batteries and loads leave the centre of what carries most a centimetre
 off, on a robot of the Nao's size (m): whether a gait falls depends on it, and a mass that is learnt says nothing of it.
 Positions tell ratios of all that makes torque: rotor inertia and damping, taken as exact, would tell how large masses
-and gains are to a few percent (`Kind.spread` of both has the sources).
+and gains are to a few percent (the two effects have the sources).
 """
 WIDTH = 2.0
 """Standard deviation of a parameter before anything is known, in changes that matter (`Parameter.scale`)."""
@@ -174,7 +176,7 @@ def _places(robot: Robot, effect: type[Effect], ground: bool) -> tuple[str, ...]
     floats = len(free_joints(robot.model)) > 0
     if effect.needs == GROUND and not (ground and floats):
         return ()
-    if issubclass(effect, DofEffect) and effect.kinds[0].unit == "1":  # a factor, of what there is
+    if issubclass(effect, DofEffect) and effect.factor:  # of what there is
         return tuple(j for j in robot.names(effect.scope) if effect.own_value(robot.model, j) > 0)
     if effect.name != LOADED:
         return robot.names(effect.scope)

@@ -143,9 +143,14 @@ class DofEffect(Effect):
     Class attributes
     ----------------
     compiled : name of the field.
+    factor : whether its number multiplies the model's own value instead of being added to it.
     """
 
     compiled: ClassVar[str] = ""
+    factor: ClassVar[bool] = False
+
+    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
+        return present * values if self.factor else super().changed(present, values)
 
     @classmethod
     def own_value(cls, model: mujoco.MjModel, place: str) -> float:

@@ -95,6 +95,7 @@ class DampingFactor(Damping):
     name: ClassVar[str] = "damping_factor"
     family: ClassVar[str] = "friction"
     compiled: ClassVar[str] = "dof_damping"
+    factor: ClassVar[bool] = True
     title: ClassVar[str] = "a change of the damping"
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
@@ -102,9 +103,6 @@ class DampingFactor(Damping):
         ("kv", "a logged effort or current; the two are confounded in positions alone"),
     )
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.0, 10.0, 0.1, spread=0.6),)
-
-    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
-        return present * values
 
 
 @dataclass(frozen=True)

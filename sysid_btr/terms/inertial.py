@@ -110,6 +110,7 @@ class ArmatureFactor(DofEffect):
     name: ClassVar[str] = "armature_factor"
     family: ClassVar[str] = "inertia"
     compiled: ClassVar[str] = "dof_armature"
+    factor: ClassVar[bool] = True
     title: ClassVar[str] = "a change of the rotor inertia"
     usual: ClassVar[bool] = False
     signed: ClassVar[bool] = True
@@ -117,9 +118,6 @@ class ArmatureFactor(DofEffect):
         ("kp", "masses that are known: positions tell ratios of masses, gains and rotor inertia alone"),
     )
     kinds: ClassVar[tuple[Kind, ...]] = (Kind("scale", "1", 1.0, 0.1, 10.0, 0.1, spread=0.3),)
-
-    def changed(self, present: FloatArray, values: FloatArray) -> FloatArray:
-        return present * values
 
 
 ARM = 0.05
