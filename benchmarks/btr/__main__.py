@@ -2,7 +2,8 @@
 
 The robots are Naos in another engine (Drake; `pip install 'sysid-btr[benchmarks]'`): `contact` differs from its model
 in the ground alone, `late` and `rough` in gains, delay, dry friction, masses, payload and ground; `drawn` in one to
-three of these at once, another amount in every seed. Each method has the same number of trials of 8 s:
+three of these at once, another amount in every seed, as does `quadruped`, which has four legs of two joints. Each
+method has the same number of trials of 8 s:
 
 - `loop`: gaits searched in models drawn from what is believed, tried by expected improvement times the chance to stand;
 - `learning`: the same, and the model is corrected by the trials (Step 3); `naming` adds what it lacks, too;
@@ -32,10 +33,11 @@ from time import process_time
 import numpy as np
 
 from benchmarks.btr.methods import METHODS, Plan
-from benchmarks.btr.robots import BODIES, NAO, ROBOTS, SPACE, TASK
+from benchmarks.btr.robots import ROBOTS, TASK, Machine
 from benchmarks.btr.table import OURS, row, show, table
 from reference_simulator.legged import DrakeRobot, Truth
 from sysid_btr.result import to_json
+from sysid_btr.terms.grammar import parse_parameters
 
 RESULTS = Path(__file__).parents[1] / "results" / "btr.json"
 
@@ -75,32 +77,34 @@ def run(name: str, method: str, seed: int, plan: Plan, out: Path) -> None:
     print(f"{name} {seed} {method}", flush=True)
     spent = folder / "cpu_s.json"
     cpu = (json.loads(spent.read_text()) if spent.exists() else 0.0) - process_time()
-    robot = DrakeRobot(NAO, TASK, SPACE, ROBOTS[name](seed), seed=seed)
+    machine, truth = ROBOTS[name]
+    robot = DrakeRobot(machine.model, TASK, machine.space, truth(seed), seed=seed)
+    terms = parse_parameters(list(machine.free), machine.model)
     try:
-        trials = METHODS[method](robot, seed, plan, folder)
+        trials = METHODS[method](robot, terms, seed, plan, folder)
     finally:
         cpu += process_time()
         spent.write_text(json.dumps(cpu))
     found = {"robot": name, "method": method, "seed": seed, "plan": vars(plan), "truth": asdict(robot.truth)}
     result = folder / "result.json"
     known = json.loads(result.read_text())["parameters"] if result.exists() and method in OURS else []
-    learnt = {p["name"]: [p["value"], *p["ci95"], truth_of(p["name"], robot.truth)] for p in known}
+    learnt = {p["name"]: [p["value"], *p["ci95"], truth_of(p["name"], robot.truth, machine)] for p in known}
     done.write_text(to_json({**found, "trials": trials, "cpu_s": cpu, "learnt": learnt}))
 
 
-def truth_of(name: str, truth: Truth) -> float | None:
+def truth_of(name: str, truth: Truth, machine: Machine) -> float | None:
     """What a parameter is on the robot: of most of its joints, in the mean over its bodies; None if this cannot say."""
     term, _, where = name.partition(":")
     if term == "command_delay":
         return truth.delay
     if term in ("kp", "kv"):
         own = getattr(truth, term)
-        factors = [own.get(j, 1.0) for j in SPACE.joints if fnmatchcase(j, where)]
+        factors = [own.get(j, 1.0) for j in machine.space.joints if fnmatchcase(j, where)]
         return float(np.median(factors)) * (truth.gain if term == "kp" and where == "*" else 1.0)
-    bodies = [b for b in BODIES if fnmatchcase(b, where)] if term == "mass" else []
+    bodies = [b for b in machine.bodies if fnmatchcase(b, where)] if term == "mass" else []
     if not bodies:
         return None
-    nominal = {b: float(NAO.model.body(b).mass[0]) for b in bodies}
+    nominal = {b: float(machine.model.model.body(b).mass[0]) for b in bodies}
     return float(np.mean([truth.mass.get(b, 1.0) + truth.payload.get(b, (0.0, ()))[0] / nominal[b] for b in bodies]))
 
 

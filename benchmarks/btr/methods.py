@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.btr.robots import NAO, SPACE, TASK
-from benchmarks.btr_nao import FREE
 from reference_simulator.legged import DrakeRobot
 from sysid_btr._typing import FloatArray
 from sysid_btr.btr.belief import Belief
@@ -26,7 +24,7 @@ from sysid_btr.btr.settings import LIKELIHOOD, Settings
 from sysid_btr.btr.world import make_world
 from sysid_btr.estimators import Budget, CmaEs, Journal, silent
 from sysid_btr.result import to_json
-from sysid_btr.terms.grammar import parse_parameters
+from sysid_btr.terms.base import Term
 
 APART = 0.1
 """Root mean square difference, fraction of the range, of gaits of one search that are tried without learning."""
@@ -36,6 +34,8 @@ ITS_SHARE = 3
 """Times as many generations as the loop has: where that searches, a candidate runs in 2.75 models in the mean."""
 ALONE = 10
 """Times as many trials that a search on the robot alone has."""
+
+Shots = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -71,16 +71,20 @@ class Plan:
         )
 
 
-def in_the_loop(change: Mapping[str, Any]) -> Callable[[DrakeRobot, int, Plan, Path], list[dict[str, Any]]]:
+Method = Callable[[DrakeRobot, Sequence[Term], int, Plan, Path], Shots]
+"""Of a robot, what its model declares, a seed, what may be spent, and a folder for what is kept: the trials."""
+
+
+def in_the_loop(change: Mapping[str, Any]) -> Method:
     """A method that is Back to Reality with some settings of its own."""
 
-    def run(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[dict[str, Any]]:
+    def run(robot: DrakeRobot, terms: Sequence[Term], seed: int, plan: Plan, folder: Path) -> Shots:
         outcome = back_to_reality(
-            NAO,
-            parse_parameters(list(FREE), NAO),
+            robot.model,
+            terms,
             robot,
-            SPACE,
-            task=TASK,
+            robot.space,
+            task=robot.task,
             settings=replace(plan.settings, **change),
             seed=seed,
             folder=folder,
@@ -97,13 +101,17 @@ def shot(trial: Trial, foreseen: Mapping[str, Any] | None = None, expected: floa
     return {"fitness": trial.fitness, "outcome": trial.outcome, "expected": expected, "foreseen": foreseen}
 
 
-def randomised(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[dict[str, Any]]:
+def stage_of(robot: DrakeRobot, terms: Sequence[Term]) -> Stage:
+    """The robot's model at its task."""
+    return Stage(make_world(robot.model, robot.task, terms, threads=1), robot.task, robot.space)
+
+
+def randomised(robot: DrakeRobot, terms: Sequence[Term], seed: int, plan: Plan, folder: Path) -> Shots:
     """One search over the prior, as many simulations as the loop's; its best gaits, no two alike, tried in order."""
-    terms = parse_parameters(list(FREE), NAO)
-    others, unmeasured = Belief.unmeasured(NAO, terms)
-    stage = Stage(make_world(NAO, TASK, (*terms, *others), threads=1), TASK, SPACE)
+    others, unmeasured = Belief.unmeasured(robot.model, terms)
+    stage, space = stage_of(robot, (*terms, *others)), robot.space
     models = Belief.before(terms).beside(unmeasured).draws(np.random.default_rng([seed, 70]), plan.draws)
-    problem = RobustProblem(stage, models, SPACE.start, SPACE.lower, SPACE.upper, Risk(weight=0.0, fall=0.0))
+    problem = RobustProblem(stage, models, space.start, space.lower, space.upper, Risk(weight=0.0, fall=0.0))
     journal = Journal(folder / "search.jsonl")
     search = replace(plan.search, max_generations=plan.generations * plan.iterations)
     search.fit(problem, rng=np.random.default_rng([seed, 71]), budget=Budget(), journal=journal, progress=silent)
@@ -117,19 +125,22 @@ class OnTheRobot:
 
     robot: DrakeRobot
     trials: list[Trial]
-    names: tuple[str, ...] = SPACE.names
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.robot.space.names
 
     @property
     def lower(self) -> FloatArray:
-        return SPACE.lower
+        return self.robot.space.lower
 
     @property
     def upper(self) -> FloatArray:
-        return SPACE.upper
+        return self.robot.space.upper
 
     @property
     def start(self) -> FloatArray:
-        return SPACE.start
+        return self.robot.space.start
 
     def loss(self, candidates: FloatArray) -> FloatArray:
         made = [self.robot.run(Controller(c)) for c in candidates]
@@ -137,7 +148,7 @@ class OnTheRobot:
         return -np.array([t.fitness for t in made])
 
 
-def repertoire(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[dict[str, Any]]:
+def repertoire(robot: DrakeRobot, terms: Sequence[Term], seed: int, plan: Plan, folder: Path) -> Shots:
     """Intelligent Trial and Error (Cully et al. 2015, doi:10.1038/nature14422).
 
     MAP-Elites fills a repertoire of gaits, the fastest of each cell of a centroidal Voronoi tessellation of their
@@ -151,15 +162,15 @@ def repertoire(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[d
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
-    stage, p = Stage(make_world(NAO, TASK, (), threads=1), TASK, SPACE), len(SPACE.names)
-    unit, width = [(0.0, 1.0)] * p, SPACE.upper - SPACE.lower
+    stage, space, p = stage_of(robot, ()), robot.space, len(robot.space.names)
+    unit, width = [(0.0, 1.0)] * p, space.upper - space.lower
     archive = CVTArchive(solution_dim=p, centroids=CELLS, ranges=unit, seed=seed)
-    first = (SPACE.start - SPACE.lower) / width
+    first = (space.start - space.lower) / width
     emitter = IsoLineEmitter(archive, x0=first, bounds=unit, batch_size=plan.search.population, seed=seed)
     scheduler = Scheduler(archive, [emitter])
     for _ in range(ITS_SHARE * plan.generations * plan.iterations):
         asked = scheduler.ask()
-        fitness, fell = stage.outcomes(SPACE.lower + asked * width, np.zeros((1, 0)))
+        fitness, fell = stage.outcomes(space.lower + asked * width, np.zeros((1, 0)))
         scheduler.tell(np.where(fell | ~np.isfinite(fitness), 0.0, fitness)[0], asked)
     gaits, foreseen = archive.data(["solution", "objective"], return_type="tuple")
     fastest = float(np.abs(foreseen).max())
@@ -173,7 +184,7 @@ def repertoire(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[d
             mean = mean + more
         mean[tried] = -np.inf
         row = int(np.argmax(mean + 0.05 * std))
-        trial = robot.run(Controller(SPACE.lower + gaits[row] * width))
+        trial = robot.run(Controller(space.lower + gaits[row] * width))
         real = trial.fitness if trial.outcome == "done" else 0.0
         tried.append(row)
         off.append((real - float(foreseen[row])) / fastest)
@@ -181,7 +192,7 @@ def repertoire(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[d
     return found
 
 
-def cmaes(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[dict[str, Any]]:
+def cmaes(robot: DrakeRobot, terms: Sequence[Term], seed: int, plan: Plan, folder: Path) -> Shots:
     problem = OnTheRobot(robot, [])
     CmaEs(sigma=0.2, population=8).fit(
         problem,
@@ -194,7 +205,7 @@ def cmaes(robot: DrakeRobot, seed: int, plan: Plan, folder: Path) -> list[dict[s
 
 
 ONE = {"draws": 1, "choice": "fittest"}
-METHODS: Mapping[str, Callable[[DrakeRobot, int, Plan, Path], list[dict[str, Any]]]] = {
+METHODS: Mapping[str, Method] = {
     "loop": in_the_loop({}),
     "learning": in_the_loop({"learn": True}),
     "naming": in_the_loop({"learn": True, "close": True}),
