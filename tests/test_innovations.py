@@ -18,12 +18,12 @@ from walks import heavier, record_walk
 
 import sysid_btr as sb
 from benchmarks import ground
-from sysid_btr.errors import UsageError
+from sysid_btr.errors import ModelError, UsageError
 from sysid_btr.floating_base import chain as chain_module
 from sysid_btr.floating_base import innovations
 from sysid_btr.floating_base.chain import Chain, Derivatives, derive, stale
 from sysid_btr.floating_base.episode import FloatingEpisode
-from sysid_btr.floating_base.innovations import Innovations, InnovationsEpisode, kalman_filter
+from sysid_btr.floating_base.innovations import Innovations, InnovationsEpisode, filter_at, follow_states, kalman_filter
 from sysid_btr.floating_base.size import NAO
 from sysid_btr.identify.fit import Fit, fit
 from sysid_btr.identify.mode import Mode
@@ -239,6 +239,29 @@ def test_derivatives_are_kept_where_they_foretell_what_a_step_does() -> None:
     mended = other.renewed(some, derive(chain, values, np.flatnonzero(some)))
     assert np.mean(stale(chain, mended, values, 1)[some]) < 0.05
     np.testing.assert_array_equal(mended.start[~some], other.start[~some])
+
+
+def test_states_from_which_simulations_fail_are_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    episode = study().train[0]
+    assert isinstance(episode, InnovationsEpisode)
+    assert episode.chain is not None
+    assert episode.known is not None
+    n = len(episode.log)
+    chain, known = episode.chain.part(0, n), episode.known.part(0, n)
+    values = Terms(chain.steps.terms).nominal
+
+    def wild(chain: Chain, known: Derivatives, found: object) -> Chain:
+        change = np.zeros_like(chain.states.std)
+        change[n // 2, -1] = 1e12
+        states = chain.states.moved(change)
+        return replace(chain, states=states, steps=replace(chain.steps, segments=states.chosen(np.arange(n - 1))))
+
+    monkeypatch.setattr(innovations, "moved_chain", wild)
+    left, there = follow_states(chain, known, values, 2)
+    np.testing.assert_array_equal(left.states.joint_velocity, chain.states.joint_velocity)
+    assert np.isfinite(filter_at(left, there, values).misfit)
+    with pytest.raises(ModelError, match="diverges within a sample"):
+        filter_at(wild(chain, known, None), known, values)
 
 
 def test_where_nothing_rubs_small_changes_to_one_side_give_the_derivatives_of_both() -> None:

@@ -210,6 +210,11 @@ class Derivatives:
             values[which] = getattr(found, name)
         return Derivatives(**mixed)
 
+    @property
+    def finite(self) -> bool:
+        """Whether no simulation failed."""
+        return all(bool(np.isfinite(getattr(self, f.name)).all()) for f in fields(self))
+
     def part(self, start: int, stop: int) -> Derivatives:
         """Those of the steps between the samples from `start` to before `stop`."""
         own = slice(start, stop - 1)
@@ -603,17 +608,29 @@ def simulate_chain(chain: Chain, values: FloatArray, free: IntArray, step: Float
     return Ends(difference(ends, states.chosen(1 + every)), np.moveaxis(by_number, 1, 2))
 
 
-def likeliest(chain: Chain, known: Derivatives, ends: Ends, slacks: Sequence[float] = (1.0,)) -> Chain:
-    """The chain with the slack, and then the size of jolts, that make its log likeliest, as parts of it show."""
+def likeliest(chain: Chain, known: Derivatives, ends: Ends, room: FloatArray, slacks: Sequence[float]) -> Chain:
+    """The chain with the slack, and then the size of jolts, that make its log likeliest, as parts of it show.
+
+    At the numbers that suit it best: those of the start may be far off. They move no farther than `room`, least and
+    largest changes (2, p): where a model lacks something, masses below nothing might suit it.
+    """
+    from scipy.optimize import lsq_linear
+
+    by_time = ends.by_number.shape[2] - room.shape[1]
+    bounds = np.hstack([room, np.tile([[-np.inf], [np.inf]], by_time)])
     parts = [(chain.part(*rows), known.part(*rows), ends.part(*rows)) for rows in stretches(chain)]
 
     @cache
     def surprise(slack: float, jolt: float) -> float:
         rounds = [linearise_chain(replace(c, slack=slack, jolt=jolt), d, e) for c, d, e in parts]
-        left = np.concatenate([r.left for r in rounds])
-        # at the numbers that suit it best: those of the start may be far off
-        best = np.linalg.lstsq(left[:, 1:], left[:, 0], rcond=1e-9)[0]
-        return sum(r.surprise for r in rounds) - float(left[:, 0] @ (left[:, 1:] @ best))
+        if not np.isfinite([r.surprise for r in rounds]).all():
+            return np.inf
+        triangle = np.linalg.qr(np.concatenate([r.left for r in rounds]), mode="r")
+        gained = (
+            float(triangle[:, 0] @ triangle[:, 0])
+            - 2 * lsq_linear(triangle[:, 1:], -triangle[:, 0], tuple(bounds)).cost
+        )
+        return sum(r.surprise for r in rounds) - gained
 
     slack, jolt = chain.slack, chain.jolt
     if len(slacks) > 1:

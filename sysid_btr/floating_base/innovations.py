@@ -478,12 +478,8 @@ class InnovationsEpisode(Episode):
             replay = FloatingReplay(robot, self.recording, tuple(terms), numerics, threads=threads, base=self.base)
             chain = with_friction(replace(chain_of(replay), slack=SLACKS[-1]), terms.nominal)
             known = derive(chain, terms.nominal)
-            if not np.isfinite(known.start).all():
-                raise ModelError(
-                    f"model {self.robot.name}: it diverges within a sample of {self.recording.path or 'the log'}, from "
-                    f"states as measured, with steps of {1e3 * numerics.timestep:.3g} ms. Check armature and masses: a "
-                    "body without mass is the usual cause."
-                )
+            if not known.finite:
+                raise diverged(chain.steps)
             with phase("states of the base", 0.9):
                 chain, known = follow_states(chain, known, terms.nominal, FIRST_ROUNDS)
             return chain, known, filter_at(chain, known, terms.nominal, fitted=False)
@@ -519,25 +515,41 @@ def _of_innovations(target: Target, own: Filter) -> Target:
 
 
 def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: int) -> tuple[Chain, Derivatives]:
-    """A chain about its most probable states under a candidate, and its derivatives there."""
+    """A chain about its most probable states under a candidate, and its derivatives there.
+
+    Or about the last states from which all of its steps can be simulated.
+    """
     terms = Terms(chain.steps.terms)
     numbers, step = np.arange(len(values)), NUDGE_NUMBER * (terms.upper - terms.lower)
+    room, sound = np.stack([terms.lower, terms.upper]) - values, (chain, known)
     for k in range(rounds):
         mention(f"round {k + 1} of {rounds}", k / rounds)
         # how large jolts are is told once states have moved, at the numbers that suit them best
         sized = slice(None if k == rounds - 2 else 0)
         ends = simulate_chain(chain, values, numbers[sized], step[sized])
         if k == rounds - 2:
-            chain = likeliest(chain, known, ends, SLACKS)
+            chain = likeliest(chain, known, ends, room, SLACKS)
         found = linearise_chain(chain, known, ends)
         if not np.isfinite(found.surprise):
-            break
+            return sound
+        sound = chain, known
         chain = moved_chain(chain, known, found)
         # they hardly depend on numbers or states, but where joints stick and slip they do
         old = stale(chain, known, values, k)
         if old.any():
             known = known.renewed(old, derive(chain, values, np.flatnonzero(old)))
+            if not known.finite:
+                return sound
     return chain, known
+
+
+def diverged(steps: SampleSteps) -> ModelError:
+    """What to say of a model that no sample of a walk can be predicted with."""
+    return ModelError(
+        f"model {steps.robot.name}: it diverges within a sample of {steps.log.path or 'the log'}, from states as "
+        f"measured, with steps of {1e3 * steps.numerics.timestep:.3g} ms. Check armature and masses: a body without "
+        "mass is the usual cause."
+    )
 
 
 def filter_at(chain: Chain, known: Derivatives, values: FloatArray, *, fitted: bool = True) -> Filter:
@@ -545,9 +557,16 @@ def filter_at(chain: Chain, known: Derivatives, values: FloatArray, *, fitted: b
 
     A model that is `fitted` and leaves more than the right one does errs, and its gains allow for it: what it lacks
     would lead all of its numbers astray. Others do not, as what gains allow for is lost for the numbers.
+
+    Raises
+    ------
+    ModelError
+        If it diverges within a sample.
     """
     ends = simulate_chain(chain, values, np.arange(0), np.zeros(0))
     late = ends.by_number[:, :, -1]
+    if not (known.finite and np.isfinite(ends.defect[chain.linked]).all() and np.isfinite(late[chain.linked]).all()):
+        raise diverged(chain.steps)
     strict = kalman_filter(replace(chain, slack=1.0), known, ends.defect, late)
     if not fitted or strict.misfit <= InnovationsProcedure.tolerated:
         return strict
