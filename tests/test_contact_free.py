@@ -208,7 +208,7 @@ def test_the_likeliest_slack_and_jolts_are_found_from_afar(
     wanted = slack, min(chain_module.JOLTS, key=lambda tried: surprise(slack, tried))
     chain = replace(chain, slack=start[0], jolt=start[1])
     bounds = np.tile([[-room - 1e-9], [room + 1e-9]], 2)
-    likeliest = chain_module.likeliest(chain, known, ends, bounds, chain_module.SLACKS)
+    likeliest = chain_module.likeliest(chain, known, ends, bounds)
     assert (likeliest.slack, likeliest.jolt) == wanted
 
 

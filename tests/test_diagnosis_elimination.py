@@ -1,4 +1,4 @@
-"""Elimination: the last turns of initial states and parameters."""
+"""Elimination: effects whose names are not likely, and the last turns of initial states and parameters."""
 
 from __future__ import annotations
 
@@ -8,14 +8,51 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_diagnosis_search import begun
+from test_diagnosis_search import ORDER, begun
 
 from sysid_btr.diagnosis import elimination as module
+from sysid_btr.diagnosis.evidence import Evidence
+from sysid_btr.diagnosis.selection import STANDARD
 from sysid_btr.diagnosis.state import State
 from sysid_btr.identify.refit import Fitted
 from sysid_btr.identify.segmented import SegmentedProcedure
 from sysid_btr.identify.study import Study
+from sysid_btr.terms.effect import Effect
 from sysid_btr.terms.model import Model
+
+
+@pytest.mark.parametrize("wanders", [True, False])
+@pytest.mark.parametrize(
+    ("sure", "kept"),
+    [
+        ((0.9, 0.3, 0.8), (0, 2)),
+        ((0.3, 0.9, 0.2), (1,)),
+        ((0.3, 0.4, 0.2), (0, 1, 2)),  # beside nothing that is likely there is nothing to keep
+        ((0.9, 0.5), (0, 1)),
+        ((0.3,), (0,)),
+    ],
+)
+def test_beside_a_name_that_is_likely_none_stays_that_is_not_where_errors_grow(
+    sure: tuple[float, ...], kept: tuple[int, ...], wanders: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = begun()
+    for kind, certainty in zip(ORDER, sure, strict=False):
+        term = kind.at(("elbow",), state.study.scales)
+        fitted = replace(state.fitted, model=state.fitted.model.with_(term, np.array([0.1])))
+        state = replace(state, fitted=fitted, evidence=(*state.evidence, Evidence(family=certainty)))
+
+    def without(state: State, effect: Effect, seconds: float) -> Fitted:
+        return replace(state.fitted, model=state.fitted.model.without(effect), evaluations=7)
+
+    monkeypatch.setattr(State, "refitted_without", without)
+    monkeypatch.setattr(module, "certainty_of", lambda known, without, now: known.family)
+    monkeypatch.setattr(SegmentedProcedure, "wanders", wanders)
+    end = module._without_unlikely(state, STANDARD)
+    left = kept if wanders else range(len(sure))
+    assert [type(effect) for effect in end.effects] == [ORDER[i] for i in left]
+    assert [known.family for known in end.evidence] == [sure[i] for i in left]
+    gone = sum(len(step.removed) for step in end.steps) - sum(len(step.removed) for step in state.steps)
+    assert gone == len(sure) - len(list(left))
 
 
 @pytest.mark.parametrize(

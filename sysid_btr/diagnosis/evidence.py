@@ -87,9 +87,13 @@ def _is_a_case_of(one: Hypothesis, other: Hypothesis) -> bool:
 
 def is_likely(rules: Selection, before: Fitted, winner: Trial, trials: Sequence[Trial]) -> bool:
     """Whether the name of one of `trials`, beside the model `before` it, is more likely right than `rules` ask for."""
-    known = evidence_of(rules, winner, trials)
-    left = left_where_it_acts(before, winner.fitted)
-    return STANDARD.certainty({"family": known.family, "place": known.place, "left": left}) >= rules.likely
+    return certainty_of(evidence_of(rules, winner, trials), before, winner.fitted) >= rules.likely
+
+
+def certainty_of(known: Evidence, without: Fitted, now: Fitted) -> float:
+    """Probability, 0 to 1, that a name is right: what speaks for it, and the model without the effect and with it."""
+    left = left_where_it_acts(without, now)
+    return STANDARD.certainty({"family": known.family, "place": known.place, "left": left})
 
 
 def at_the_likeliest_place(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Trial:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid_btr._typing import IntArray
 from sysid_btr.diagnosis.evidence import evidence_of, is_likely, is_missed, likeliest
-from sysid_btr.diagnosis.hypotheses import Hypothesis
+from sysid_btr.diagnosis.hypotheses import Hypothesis, name_at
 from sysid_btr.diagnosis.leads import Library, hypotheses_at, replacements
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
@@ -59,7 +59,7 @@ class _Part:
         return [i for i, place in enumerate(self.effect.places) if (place in self.places) is gone]
 
     def __str__(self) -> str:
-        return f"{self.effect.name} at {', '.join(self.places)}"
+        return name_at(type(self.effect), self.places)
 
 
 def exchange(state: State, library: Library, rules: Selection) -> State:

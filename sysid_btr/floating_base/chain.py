@@ -608,7 +608,7 @@ def simulate_chain(chain: Chain, values: FloatArray, free: IntArray, step: Float
     return Ends(difference(ends, states.chosen(1 + every)), np.moveaxis(by_number, 1, 2))
 
 
-def likeliest(chain: Chain, known: Derivatives, ends: Ends, room: FloatArray, slacks: Sequence[float]) -> Chain:
+def likeliest(chain: Chain, known: Derivatives, ends: Ends, room: FloatArray) -> Chain:
     """The chain with the slack, and then the size of jolts, that make its log likeliest, as parts of it show.
 
     At the numbers that suit it best: those of the start may be far off. They move no farther than `room`, least and
@@ -625,17 +625,12 @@ def likeliest(chain: Chain, known: Derivatives, ends: Ends, room: FloatArray, sl
         rounds = [linearise_chain(replace(c, slack=slack, jolt=jolt), d, e) for c, d, e in parts]
         if not np.isfinite([r.surprise for r in rounds]).all():
             return np.inf
-        triangle = np.linalg.qr(np.concatenate([r.left for r in rounds]), mode="r")
-        gained = (
-            float(triangle[:, 0] @ triangle[:, 0])
-            - 2 * lsq_linear(triangle[:, 1:], -triangle[:, 0], tuple(bounds)).cost
-        )
-        return sum(r.surprise for r in rounds) - gained
+        left = np.linalg.qr(np.concatenate([r.left for r in rounds])).R
+        best = lsq_linear(left[:, 1:], -left[:, 0], tuple(bounds))
+        return float(sum(r.surprise for r in rounds) - left[:, 0] @ left[:, 0] + 2 * best.cost)
 
-    slack, jolt = chain.slack, chain.jolt
-    if len(slacks) > 1:
-        slack = _lowest(slacks, slack, lambda tried: surprise(tried, jolt))
-    return replace(chain, slack=slack, jolt=_lowest(JOLTS, jolt, lambda tried: surprise(slack, tried)))
+    slack = _lowest(SLACKS, chain.slack, lambda tried: surprise(tried, chain.jolt))
+    return replace(chain, slack=slack, jolt=_lowest(JOLTS, chain.jolt, lambda tried: surprise(slack, tried)))
 
 
 def _lowest(sizes: Sequence[float], start: float, surprise: Callable[[float], float]) -> float:

@@ -528,7 +528,7 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
         sized = slice(None if k == rounds - 2 else 0)
         ends = simulate_chain(chain, values, numbers[sized], step[sized])
         if k == rounds - 2:
-            chain = likeliest(chain, known, ends, room, SLACKS)
+            chain = likeliest(chain, known, ends, room)
         found = linearise_chain(chain, known, ends)
         if not np.isfinite(found.surprise):
             return sound
