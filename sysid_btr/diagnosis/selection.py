@@ -132,7 +132,7 @@ class Selection:
 
     likely: float = 0.5
     """Certainty of its name from which one more is added to effects that explain the log already (`explained`): it must
-    be more likely right than not."""
+    be more likely right than not. Over segments, from which one stays beside one that is."""
     patience: int = 2
     """Effects in turn that are added without being so likely, beside one that is, after which these go again. One may
     wait for another that acts where it does. Judgement."""
