@@ -608,29 +608,22 @@ def simulate_chain(chain: Chain, values: FloatArray, free: IntArray, step: Float
     return Ends(difference(ends, states.chosen(1 + every)), np.moveaxis(by_number, 1, 2))
 
 
-def likeliest(chain: Chain, known: Derivatives, ends: Ends, room: FloatArray) -> Chain:
-    """The chain with the slack, and then the size of jolts, that make its log likeliest, as parts of it show.
-
-    At the numbers that suit it best: those of the start may be far off. They move no farther than `room`, least and
-    largest changes (2, p): where a model lacks something, masses below nothing might suit it.
-    """
-    from scipy.optimize import lsq_linear
-
-    by_time = ends.by_number.shape[2] - room.shape[1]
-    bounds = np.hstack([room, np.tile([[-np.inf], [np.inf]], by_time)])
+def likeliest(chain: Chain, known: Derivatives, ends: Ends, slacks: Sequence[float] = (1.0,)) -> Chain:
+    """The chain with the slack, and then the size of jolts, that make its log likeliest, as parts of it show."""
     parts = [(chain.part(*rows), known.part(*rows), ends.part(*rows)) for rows in stretches(chain)]
 
     @cache
     def surprise(slack: float, jolt: float) -> float:
         rounds = [linearise_chain(replace(c, slack=slack, jolt=jolt), d, e) for c, d, e in parts]
-        if not np.isfinite([r.surprise for r in rounds]).all():
-            return np.inf
-        left = np.linalg.qr(np.concatenate([r.left for r in rounds])).R
-        best = lsq_linear(left[:, 1:], -left[:, 0], tuple(bounds))
-        return float(sum(r.surprise for r in rounds) - left[:, 0] @ left[:, 0] + 2 * best.cost)
+        left = np.concatenate([r.left for r in rounds])
+        # at the numbers that suit it best: those of the start may be far off
+        best = np.linalg.lstsq(left[:, 1:], left[:, 0], rcond=1e-9)[0]
+        return sum(r.surprise for r in rounds) - float(left[:, 0] @ (left[:, 1:] @ best))
 
-    slack = _lowest(SLACKS, chain.slack, lambda tried: surprise(tried, chain.jolt))
-    return replace(chain, slack=slack, jolt=_lowest(JOLTS, chain.jolt, lambda tried: surprise(slack, tried)))
+    slack, jolt = chain.slack, chain.jolt
+    if len(slacks) > 1:
+        slack = _lowest(slacks, slack, lambda tried: surprise(tried, jolt))
+    return replace(chain, slack=slack, jolt=_lowest(JOLTS, jolt, lambda tried: surprise(slack, tried)))
 
 
 def _lowest(sizes: Sequence[float], start: float, surprise: Callable[[float], float]) -> float:

@@ -521,14 +521,14 @@ def follow_states(chain: Chain, known: Derivatives, values: FloatArray, rounds: 
     """
     terms = Terms(chain.steps.terms)
     numbers, step = np.arange(len(values)), NUDGE_NUMBER * (terms.upper - terms.lower)
-    room, sound = np.stack([terms.lower, terms.upper]) - values, (chain, known)
+    sound = chain, known
     for k in range(rounds):
         mention(f"round {k + 1} of {rounds}", k / rounds)
         # how large jolts are is told once states have moved, at the numbers that suit them best
         sized = slice(None if k == rounds - 2 else 0)
         ends = simulate_chain(chain, values, numbers[sized], step[sized])
         if k == rounds - 2:
-            chain = likeliest(chain, known, ends, room)
+            chain = likeliest(chain, known, ends, SLACKS)
         found = linearise_chain(chain, known, ends)
         if not np.isfinite(found.surprise):
             return sound
