@@ -141,6 +141,17 @@ def study(delay: float = 0.0) -> Study:
     return make_study(load_robot("nao"), [walk(delay)], threads=2)
 
 
+def fitted_part() -> tuple[Chain, Derivatives, np.ndarray]:
+    """The chain of what is fitted of the walk, its derivatives, and the numbers of the plain model."""
+    episode = study().train[0]
+    assert isinstance(episode, InnovationsEpisode)
+    assert episode.chain is not None
+    assert episode.known is not None
+    n = len(episode.log)
+    chain, known = episode.chain.part(0, n), episode.known.part(0, n)
+    return chain, known, Terms(chain.steps.terms).nominal
+
+
 @cache
 def found() -> Fit:
     return fit(study(), ["mass:LKneePitch,RKneePitch", "kp:*=shared"])
@@ -225,36 +236,25 @@ def test_what_a_joint_holds_that_stands_still_is_not_known_and_does_not_depend_o
 
 
 def test_derivatives_are_kept_where_they_foretell_what_a_step_does() -> None:
-    episode = study().train[0]
-    assert isinstance(episode, InnovationsEpisode)
-    assert episode.chain is not None
-    assert episode.known is not None
-    n = len(episode.log)
-    chain, known = episode.chain.part(0, n), episode.known.part(0, n)
-    values = Terms(chain.steps.terms).nominal
+    chain, known, values = fitted_part()
     assert np.mean(stale(chain, known, values, 0)) < 0.05
     other = replace(known, start=2.0 * known.start)
     assert np.all(stale(chain, other, values, 0)[chain.linked])
-    some = np.arange(n - 1) % 3 == 0
+    some = np.arange(len(chain.linked)) % 3 == 0
     mended = other.renewed(some, derive(chain, values, np.flatnonzero(some)))
     assert np.mean(stale(chain, mended, values, 1)[some]) < 0.05
     np.testing.assert_array_equal(mended.start[~some], other.start[~some])
 
 
 def test_states_from_which_simulations_fail_are_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    episode = study().train[0]
-    assert isinstance(episode, InnovationsEpisode)
-    assert episode.chain is not None
-    assert episode.known is not None
-    n = len(episode.log)
-    chain, known = episode.chain.part(0, n), episode.known.part(0, n)
-    values = Terms(chain.steps.terms).nominal
+    chain, known, values = fitted_part()
 
     def wild(chain: Chain, known: Derivatives, found: object) -> Chain:
         change = np.zeros_like(chain.states.std)
-        change[n // 2, -1] = 1e12
+        change[len(change) // 2, -1] = 1e12
         states = chain.states.moved(change)
-        return replace(chain, states=states, steps=replace(chain.steps, segments=states.chosen(np.arange(n - 1))))
+        starts = states.chosen(np.arange(len(change) - 1))
+        return replace(chain, states=states, steps=replace(chain.steps, segments=starts))
 
     monkeypatch.setattr(innovations, "moved_chain", wild)
     left, there = follow_states(chain, known, values, 2)

@@ -92,8 +92,12 @@ def is_likely(rules: Selection, before: Fitted, winner: Trial, trials: Sequence[
 
 def certainty_of(known: Evidence, without: Fitted, now: Fitted) -> float:
     """Probability, 0 to 1, that a name is right: what speaks for it, and the model without the effect and with it."""
-    left = left_where_it_acts(without, now)
-    return STANDARD.certainty({"family": known.family, "place": known.place, "left": left})
+    return STANDARD.certainty(grounds_of(known, without, now))
+
+
+def grounds_of(known: Evidence, without: Fitted, now: Fitted) -> dict[str, float]:
+    """What the certainty of a name follows from: weights of its family and place, and what is left where it acts."""
+    return {"family": known.family, "place": known.place, "left": left_where_it_acts(without, now)}
 
 
 def at_the_likeliest_place(rules: Selection, winner: Trial, trials: Sequence[Trial]) -> Trial:

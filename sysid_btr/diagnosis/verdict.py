@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from sysid_btr.diagnosis import certainty
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, Verdict
-from sysid_btr.diagnosis.evidence import Evidence, left_where_it_acts, share_explained
+from sysid_btr.diagnosis.evidence import Evidence, grounds_of, share_explained
 from sysid_btr.diagnosis.messages import message_of, sentence_of
 from sysid_btr.diagnosis.selection import Selection, differs_from, is_log_explained, something_left, verdict_limit
 from sysid_btr.diagnosis.signature import signature
@@ -97,8 +97,7 @@ def _named(
     effect: Effect, own: tuple[Estimate, ...], evidence: Evidence, off: Fitted, state: State, rules: Selection
 ) -> NamedEffect:
     now = state.fitted
-    left = left_where_it_acts(off, now)
-    known = {"family": evidence.family, "place": evidence.place, "left": left}
+    known = grounds_of(evidence, off, now)
     # what alone explains a log is there, whichever of its numbers it is
     alone = len(state.effects) == 1
     sized = alone or any(differs_from(estimate, nothing) for estimate, nothing in zip(own, effect.neutral, strict=True))
@@ -114,7 +113,7 @@ def _named(
         certainty=sure,
         otherwise=otherwise,
         explains={"train": share_explained(off.train, now.train), "holdout": share_explained(off.holdout, now.holdout)},
-        provisional=left > rules.rest,
+        provisional=known["left"] > rules.rest,
         gain_holdout=float((off.holdout - now.holdout) / max(off.holdout, 1e-12)),
         confused_with=tuple(dict.fromkeys((*evidence.rivals, *giving_way(effect, state.candidates)))),
         sentence=sentence_of(effect, own),
