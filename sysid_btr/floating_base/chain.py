@@ -26,7 +26,6 @@ from sysid_btr.io.noise import noise_floor
 from sysid_btr.mujoco_conventions import to_rotation
 from sysid_btr.simulation.base_states import BASE, BaseStates, free_addresses
 from sysid_btr.simulation.compiling import compile_model, make_index
-from sysid_btr.simulation.grid import Grid
 from sysid_btr.simulation.segments import SegmentReplay, Segments
 from sysid_btr.simulation.setup import Setup, Values
 from sysid_btr.simulation.silence import silenced
@@ -125,10 +124,8 @@ class SampleSteps(FloatingReplay):
         return replace(make_index(self.model), base=free_addresses(self.model))
 
     @cached_property
-    def grid(self) -> Grid:
-        grid = super().grid
-        rows = np.maximum(np.arange(grid.steps) - self.late, 0)
-        return replace(grid, command=grid.command[rows], extra=grid.extra[rows])
+    def given(self) -> tuple[FloatArray, FloatArray]:
+        return self.commands_between(self.borders - self.late * self.numerics.timestep)
 
     @cached_property
     def feet(self) -> list[int]:

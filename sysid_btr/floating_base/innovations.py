@@ -101,7 +101,7 @@ class Foreseen(SampleSteps):
             if part.effort is not None:
                 effort[row[sims], segment[sims]] = part.effort[:, 0]
                 effort[at] = part.effort[:, -1]
-        return Outputs(self.grid.sample_time, position, velocity, effort if self.effort else None, base)
+        return Outputs(self.log.time - self.log.time[0], position, velocity, effort if self.effort else None, base)
 
 
 @dataclass(frozen=True, eq=False)

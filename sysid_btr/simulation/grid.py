@@ -72,29 +72,54 @@ def make_grid(
     size = 8 * time[-1] / timestep * (4 + 3 * len(joints) + len(controls or {}))
     what = f"replaying {time[-1]:.6g} s in steps of {timestep:.3g} s"
     require_memory(size, what, "replay a part of the log, or take a longer step (servo_period of the log)")
-    exact = time / timestep
-    rounded = np.round(exact)
-    aligned = np.abs(exact - rounded) < ALIGNED
-    low = np.where(aligned, rounded, np.floor(exact)).astype(np.int64)
-    fraction = np.where(aligned, 0.0, exact - low)
-    high = np.where(fraction > 0, low + 1, low)
+    low, high, fraction = on_steps(time, timestep)
     state = np.unique(np.concatenate([low, high]))
-    steps = max(int(state[-1]), 1)
-    snapped = np.where(aligned, rounded * timestep, time)
-    still, own = np.zeros(len(joints)), dict(controls or {})
-    extra = [_mean_command(log, snapped, tuple(own), np.array(list(own.values())), timestep, steps)]
-    if any(log.joints(channel) for channel in FED_FORWARD):
-        extra += [_mean_command(log, snapped, joints, still, timestep, steps, channel) for channel in FED_FORWARD]
+    borders = even_borders(max(int(state[-1]), 1), timestep)
+    command, extra = mean_commands(log, joints, defaults, controls or {}, borders)
     return Grid(
         timestep=timestep,
-        command=_mean_command(log, snapped, joints, defaults, timestep, steps),
-        extra=np.concatenate(extra, axis=1),
+        command=command,
+        extra=extra,
         sample_time=time,
         state=state,
         before=np.searchsorted(state, low),
         after=np.searchsorted(state, high),
         fraction=fraction,
     )
+
+
+def even_borders(steps: int, timestep: float) -> FloatArray:
+    """(steps + 1,) borders, s, of so many steps."""
+    return np.asarray(np.arange(steps + 1) * timestep, dtype=np.float64)
+
+
+def on_steps(time: FloatArray, timestep: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """Borders before and after times (n,) since the first one, and fractions of a step from the former, (n,) each."""
+    exact = time / timestep
+    rounded = np.round(exact)
+    aligned = np.abs(exact - rounded) < ALIGNED
+    low = np.where(aligned, rounded, np.floor(exact)).astype(np.int64)
+    fraction = np.where(aligned, 0.0, exact - low)
+    return low, np.where(fraction > 0, low + 1, low), fraction
+
+
+def mean_commands(
+    log: Log, joints: tuple[str, ...], defaults: FloatArray, controls: Mapping[str, float], borders: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Commands of joints, (..., steps, j), and of what else there is, as in `Grid`, over steps between borders.
+
+    Parameters
+    ----------
+    log, joints, defaults, controls : see `make_grid`.
+    borders : (..., steps + 1) s since the first sample, at equal distances. Before a log its first command holds.
+    """
+    time = log.time - log.time[0]
+    borders = _at_samples_near(time, borders)
+    still, own = np.zeros(len(joints)), dict(controls)
+    extra = [_mean_command(log, time, tuple(own), np.array(list(own.values())), borders)]
+    if any(log.joints(channel) for channel in FED_FORWARD):
+        extra += [_mean_command(log, time, joints, still, borders, channel) for channel in FED_FORWARD]
+    return _mean_command(log, time, joints, defaults, borders), np.concatenate(extra, axis=-1)
 
 
 def at_samples(grid: Grid, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -115,8 +140,7 @@ def _mean_command(
     time: FloatArray,
     joints: tuple[str, ...],
     defaults: FloatArray,
-    timestep: float,
-    steps: int,
+    borders: FloatArray,
     channel: str = "command",
 ) -> FloatArray:
     """Mean over each step of the command as the servo sees it; exact for a held command.
@@ -125,50 +149,55 @@ def _mean_command(
     """
     from sysid_btr.io.resample import command_at
 
-    result = np.tile(defaults, (steps, 1))
+    result = np.tile(defaults, (*borders.shape[:-1], borders.shape[-1] - 1, 1))
     named = [j for j in joints if log.has(channel, j)]
     if not named:
         return result
     columns = [joints.index(j) for j in named]
-    borders = np.arange(steps + 1) * timestep
     if log.meta.command_hold == "linear":
-        result[:, columns] = command_at(log, named, log.time[0] + (borders[:-1] + timestep / 2), channel)
-        return result
-    held = command_at(log, named, log.time, channel)
-    result[:, columns] = mean_over_steps(time, held, timestep, steps)
+        middle = 0.5 * (borders[..., :-1] + borders[..., 1:])
+        result[..., columns] = command_at(log, named, log.time[0] + middle.ravel(), channel).reshape(*middle.shape, -1)
+    else:
+        result[..., columns] = mean_over_steps(time, command_at(log, named, log.time, channel), borders)
     return result
 
 
-def mean_over_steps(time: FloatArray, held: FloatArray, timestep: float, steps: int) -> FloatArray:
+def mean_over_steps(time: FloatArray, held: FloatArray, borders: FloatArray) -> FloatArray:
     """Mean over each step of values held from one sample to the next.
 
     Parameters
     ----------
-    time : (n,) s since the start of the grid, increasing.
-    held : (n, k); the last one stays.
-    timestep : s.
-    steps : number of steps.
+    time : (n,) s since the first sample, increasing.
+    held : (n, k); the first one is there before, the last one stays.
+    borders : (..., steps + 1) s since the first sample, increasing.
 
     Returns
     -------
-    (steps, k) array.
+    (..., steps, k) array.
     """
-    borders = np.arange(steps + 1) * timestep
-    span = np.diff(time, append=max(time[-1], borders[-1]) + timestep)
+    span = np.diff(time, append=max(time[-1], float(borders.max())) + 1.0)
     # relative to the first value, so that the cumulative sum keeps its digits
     change = held - held[0]
     integral = np.vstack([np.zeros(held.shape[1]), np.cumsum(change * span[:, None], axis=0)])
-    knots = np.append(time, time[-1] + span[-1])
-    result = np.empty((steps, held.shape[1]))
+    knots, width = np.append(time, time[-1] + span[-1]), np.diff(borders)
+    result = np.empty((*width.shape, held.shape[1]))
     for k in range(held.shape[1]):
-        result[:, k] = held[0, k] + np.diff(np.interp(borders, knots, integral[:, k])) / timestep
+        result[..., k] = held[0, k] + np.diff(np.interp(borders, knots, integral[:, k])) / width
     return result
 
 
-def step_inputs(log: Log, grid: Grid) -> dict[str, FloatArray]:
-    """Measured drive inputs a law may use, (steps,) each: means of supply voltage and enabled flags.
+def _at_samples_near(time: FloatArray, borders: FloatArray) -> FloatArray:
+    """Borders, at the samples that are `ALIGNED` with them: no part of a command goes into the step before its own."""
+    near = np.clip(np.round(np.interp(borders, time, np.arange(len(time)))).astype(np.int64), 0, len(time) - 1)
+    there = time[near]
+    return np.where(np.abs(there - borders) < ALIGNED * np.diff(borders).min(), there, borders)
 
-    A missing value leaves the one before it in force; a column without any value is left out.
+
+def step_inputs(log: Log, borders: FloatArray) -> dict[str, FloatArray]:
+    """Measured drive inputs a law may use, (..., steps) each: means of supply voltage and enabled flags.
+
+    `borders` of steps are those of `mean_over_steps`. A missing value leaves the one before it in force; a column
+    without any value is left out.
     """
     inputs: dict[str, FloatArray] = {}
     for name, values in log.channels.items():
@@ -177,5 +206,5 @@ def step_inputs(log: Log, grid: Grid) -> dict[str, FloatArray]:
             continue
         last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
         held = np.asarray(values, dtype=np.float64)[known[last], None]
-        inputs[name] = mean_over_steps(grid.sample_time, held, grid.timestep, grid.steps)[:, 0]
+        inputs[name] = mean_over_steps(log.time - log.time[0], held, borders)[..., 0]
     return inputs

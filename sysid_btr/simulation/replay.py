@@ -20,7 +20,7 @@ from sysid_btr.models.pose import resting
 from sysid_btr.models.robot import Robot
 from sysid_btr.simulation.base_states import BaseStates, free_addresses, place_base
 from sysid_btr.simulation.compiling import compile_model, made_elsewhere, make_index
-from sysid_btr.simulation.grid import Grid, at_samples, make_grid, step_inputs
+from sysid_btr.simulation.grid import Grid, at_samples, even_borders, make_grid, mean_commands, step_inputs
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.registry import get_simulator
 from sysid_btr.simulation.servo import ServoLaw
@@ -147,6 +147,11 @@ class Replay:
     def grid(self) -> Grid:
         commands, (defaults, controls) = commanded(self.log, self.model), self.idle
         return make_grid(commands, self.index.joints, defaults, self.numerics.timestep, controls)
+
+    def commands_between(self, borders: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Commands over steps of one's own, see `mean_commands`."""
+        commands, (defaults, controls) = commanded(self.log, self.model), self.idle
+        return mean_commands(commands, self.index.joints, defaults, controls, borders)
 
     def predict(self, candidates: FloatArray) -> Outputs:
         """All predicted sensors at once; for many candidates iterate over `chunks` instead."""
@@ -278,6 +283,6 @@ class Replay:
 
 def _inputs_of(logs: Sequence[tuple[Log, Grid]], steps: int, rows: int) -> dict[str, FloatArray]:
     """Measured drive inputs, (steps, rows), of logs that each own an equal share of the rows."""
-    own = [step_inputs(log, replace(grid, command=np.empty((steps, 0)))) for log, grid in logs]
+    own = [step_inputs(log, even_borders(steps, grid.timestep)) for log, grid in logs]
     share = rows // len(logs)
     return {name: np.repeat(np.stack([inputs[name] for inputs in own], axis=1), share, axis=1) for name in own[0]}

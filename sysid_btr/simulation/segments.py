@@ -17,7 +17,7 @@ import numpy as np
 
 from sysid_btr._typing import BoolArray, FloatArray, IntArray
 from sysid_btr.simulation.base_states import BASE, BaseStates, place_base
-from sysid_btr.simulation.grid import Grid, step_inputs
+from sysid_btr.simulation.grid import Grid, on_steps, step_inputs
 from sysid_btr.simulation.replay import CHUNK_DOFS, Replay
 from sysid_btr.simulation.setup import Setup, Values, prepare
 from sysid_btr.simulation.start import behind_sensors
@@ -49,7 +49,7 @@ class Segments:
     std : (w, b + 2 j) standard deviations: of the base's position, rotation (in its frame), velocity and angular
         velocity where it floats, b = 12, else b = 0; of joint positions and joint velocities.
     base : of the base where it floats.
-    joint_acceleration : (w, j), by which a start between two borders is taken back to the first; None for none.
+    joint_acceleration : (w, j), by which the motion about a start bends; None for none.
     """
 
     rows: IntArray
@@ -96,18 +96,6 @@ class Segments:
             base=None if self.base is None else self.base.moved(change[:, :b]),
         )
 
-    def late(self, seconds: FloatArray) -> Segments:
-        """The same with starts that are so much earlier, (w,), on the same course."""
-        back, ago = np.zeros_like(self.std), -seconds[:, None]
-        b, j = self.base_numbers, self.joint_position.shape[1]
-        back[:, b : b + j] = ago * self.joint_velocity
-        if self.joint_acceleration is not None:
-            back[:, b : b + j] += 0.5 * ago**2 * self.joint_acceleration
-            back[:, b + j :] = ago * self.joint_acceleration
-        if self.base is not None:
-            back[:, :3], back[:, 3:6] = ago * self.base.velocity, ago * self.base.rate
-        return self.moved(back)
-
 
 def segment_seconds(segments: Segments, log: Log) -> float:
     """Length of a segment, s; 0 where there is none."""
@@ -135,14 +123,11 @@ def covered(segments: Segments, samples: int) -> BoolArray:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Where a segment lies on the log's grid: first border, and its samples relative to that."""
+    """Where the samples of a segment lie on steps that begin with its first one."""
 
-    first: int
     before: IntArray
     after: IntArray
     fraction: FloatArray
-    late: float
-    """s from the first border to the first sample."""
     steps: int
     """Steps to its last sample, and the one after it where torques are predicted."""
 
@@ -185,24 +170,34 @@ class SegmentReplay(Replay):
 
     @cached_property
     def _frames(self) -> list[_Frame]:
-        grid = self.grid
-        low, high = grid.state[grid.before], grid.state[grid.after]
-        frames = []
+        time, frames = self.log.time, []
         for a, b in self._segments.rows:
-            first = int(low[a])
+            low, high, fraction = on_steps(time[a:b] - time[a], self.numerics.timestep)
             # the torque at a sample is that of the step that begins there
-            end = int(low[b - 1]) + 1 if self.effort else int(high[b - 1])
-            frames.append(
-                _Frame(
-                    first,
-                    low[a:b] - first,
-                    high[a:b] - first,
-                    grid.fraction[a:b],
-                    float(grid.fraction[a] * grid.timestep),
-                    max(end - first, 1),
-                )
-            )
+            end = int(low[-1]) + 1 if self.effort else int(high[-1])
+            frames.append(_Frame(low, high, fraction, max(end, 1)))
         return frames
+
+    @cached_property
+    def _began(self) -> FloatArray:
+        """(w,) s on the clock of the log at which segments begin."""
+        return np.asarray(self.log.time[self._segments.rows[:, 0]] - self.log.time[0])
+
+    @cached_property
+    def _leading(self) -> int:
+        """Steps before a segment whose commands may still reach into it."""
+        return round(self.lead / self.numerics.timestep)
+
+    @cached_property
+    def borders(self) -> FloatArray:
+        """(w, ...) borders, s on the clock of the log, of the steps of segments and of those that lead to them."""
+        steps = np.arange(-self._leading, max((frame.steps for frame in self._frames), default=0) + 1)
+        return np.asarray(self._began[:, None] + steps * self.numerics.timestep)
+
+    @cached_property
+    def given(self) -> tuple[FloatArray, FloatArray]:
+        """Commands of joints and of what else there is over the steps between `borders`, (w, lead + steps, ...)."""
+        return self.commands_between(self.borders)
 
     def _run(self, candidates: FloatArray) -> Outputs:
         m, w = len(candidates), len(self._segments)
@@ -219,7 +214,7 @@ class SegmentReplay(Replay):
                 velocity[row[i], a:b] = part.velocity[s]
                 if effort is not None and part.effort is not None:
                     effort[row[i], a:b] = part.effort[s]
-        return Outputs(self.grid.sample_time, position, velocity, effort)
+        return Outputs(self.log.time - self.log.time[0], position, velocity, effort)
 
     def respond(self, values: FloatArray, directions: FloatArray) -> Iterator[tuple[int, Outputs]]:
         """Sensors in each segment under changes of its start.
@@ -285,7 +280,7 @@ class SegmentReplay(Replay):
         self, pairs: Values, sims: IntArray, segment: IntArray, change: FloatArray | None
     ) -> Iterator[tuple[IntArray, Outputs]]:
         """One batch of simulations, read where they share their sample times."""
-        h, steps = self.grid.timestep, max(self._frames[w].steps for w in segment)
+        h, steps = self.numerics.timestep, max(self._frames[w].steps for w in segment)
         setup = self._setup(pairs, segment, change, steps)
         states = self.simulate(setup, np.arange(steps + 1))
         borders = np.flatnonzero(np.diff(self._clock[segment], prepend=-1, append=-1))
@@ -309,34 +304,34 @@ class SegmentReplay(Replay):
 
     def _setup(self, pairs: Values, segment: IntArray, change: FloatArray | None, steps: int) -> Setup:
         """Segments from their initial states, with `change` added to these."""
-        h = self.grid.timestep
-        starts = self.starts.chosen(segment)
+        starts, began, lead = self.starts.chosen(segment), self._began[segment], self._leading
         if change is not None:
             starts = starts.moved(change[:, : starts.std.shape[1]])
-        first, late = (np.array([getattr(frame, n) for frame in self._frames])[segment] for n in ("first", "late"))
-        if late.any():
-            starts = starts.late(late)
         batch = self.batch(pairs, len(segment))
         course = starts.joint_position, starts.joint_velocity, starts.joint_acceleration
-        qpos, qvel = behind_sensors(batch, pairs, self.shown, *course, h * first)
-        lead = round(self.lead / h)
-        rows = np.clip(first[:, None] + np.arange(-lead, steps), 0, self.grid.steps - 1)
+        qpos, qvel = behind_sensors(batch, pairs, self.shown, *course, began)
+        command, extra = (values[segment, : lead + steps] for values in self.given)
         setup = prepare(
             batch,
             pairs,
             qpos,
             qvel,
-            self.grid.command[rows],
+            command,
             self.numerics,
-            inputs=lambda: {n: values[rows[:, lead:].T] for n, values in step_inputs(self.log, self.grid).items()},
+            inputs=lambda: {n: values[segment, :steps].T for n, values in self._inputs.items()},
             effort=self.effort,
-            first=first,
+            began=began,
             lead=lead,
-            extra=self.grid.extra[rows],
+            extra=extra,
         )
         if starts.base is not None:
             place_base(setup, starts.base)
         return replace(setup, state={**setup.state, **self.push(batch, segment, change)})
+
+    @cached_property
+    def _inputs(self) -> dict[str, FloatArray]:
+        """Measured inputs of the drives over the steps of segments, (w, steps) each."""
+        return step_inputs(self.log, self.borders[:, self._leading :])
 
     def lanes(self) -> list[list[tuple[int, IntArray]]]:
         """Numbers of a start that one simulation can vary together: (position in `Segments.std`, joints it moves).

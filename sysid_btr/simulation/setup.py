@@ -113,7 +113,7 @@ def prepare(
     *,
     inputs: Callable[[], dict[str, FloatArray]] = dict,
     effort: bool = False,
-    first: IntArray | int = 0,
+    began: FloatArray | float = 0.0,
     lead: int = 0,
     extra: FloatArray | None = None,
 ) -> Setup:
@@ -127,7 +127,7 @@ def prepare(
     numerics : with which the model was compiled.
     inputs : gives the measured inputs of the drives, (steps, m) each, where a law asks for them.
     effort : whether the torques of the servos are asked for.
-    first : steps on the clock of the log before the first one, of each candidate (m,) or of all, for torques known in
+    began : s on the clock of the log before the first step, of each candidate (m,) or of all, for torques known in
         advance and laws.
     lead : commands from before the first step, that reach into it when they are delayed.
     extra : (m, lead + steps, ...) what else was commanded, as `Grid.extra` has it.
@@ -136,8 +136,8 @@ def prepare(
     if extra is not None and extra.shape[-1] > controls:
         command = command + fed_forward(batch, *np.split(extra[..., controls:], 2, axis=-1))
     applied: FloatArray | None = None
-    steps = np.atleast_1d(first)[:, None] + np.arange(-lead, command.shape[1] - lead + 1, dtype=np.float64)
-    time = batch.timestep * steps
+    steps = np.arange(-lead, command.shape[1] - lead + 1, dtype=np.float64)
+    time = np.atleast_1d(began)[:, None] + batch.timestep * steps
     for term, values in pairs:
         term.initial_state(batch, values, qpos, qvel)
         command = term.shape_command(batch, values, command, time)
@@ -159,7 +159,7 @@ def prepare(
         applied,
         laws,
         inputs() if laws else {},
-        batch.timestep * np.asarray(first, dtype=np.float64),
+        np.asarray(began, dtype=np.float64),
         numerics.held_steps,
         effort,
         control,
