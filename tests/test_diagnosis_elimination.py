@@ -47,12 +47,38 @@ def test_beside_a_name_that_is_likely_none_stays_that_is_not_where_errors_grow(
     monkeypatch.setattr(State, "refitted_without", without)
     monkeypatch.setattr(module, "certainty_of", lambda known, without, now: known.family)
     monkeypatch.setattr(SegmentedProcedure, "wanders", wanders)
-    end = module._without_unlikely(state, STANDARD)
+    end, known = module._without_unlikely(state, STANDARD)
     left = kept if wanders else range(len(sure))
     assert [type(effect) for effect in end.effects] == [ORDER[i] for i in left]
     assert [known.family for known in end.evidence] == [sure[i] for i in left]
     gone = sum(len(step.removed) for step in end.steps) - sum(len(step.removed) for step in state.steps)
     assert gone == len(sure) - len(list(left))
+    assert len(known) == (len(list(left)) if wanders and len(list(left)) > 1 else 0)
+
+
+def test_what_is_known_without_an_effect_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = begun()
+    for kind in ORDER[:3]:
+        term = kind.at(("elbow",), state.study.scales)
+        fitted = replace(state.fitted, model=state.fitted.model.with_(term, np.array([0.1])))
+        state = replace(state, fitted=fitted, evidence=(*state.evidence, Evidence()))
+    asked: list[type[Effect]] = []
+
+    def without(state: State, effect: Effect, seconds: float) -> Fitted:
+        asked.append(type(effect))
+        return replace(state.fitted, model=state.fitted.model.without(effect), evaluations=7)
+
+    monkeypatch.setattr(State, "refitted_without", without)
+    monkeypatch.setattr(module, "_at_fewer_locations", lambda state, effect, rules: (state, ()))
+    monkeypatch.setattr(
+        module, "is_needed", lambda rules, trial, now, transient: ORDER[0] not in {type(t) for t in trial.model.terms}
+    )
+    known = [without(state, effect, 1.0) for effect in state.effects]
+    asked.clear()
+    (kept,) = module._pruned(state, STANDARD, known).effects
+    assert type(kept) is ORDER[0]
+    # the first two are known of this model; the last one is asked of that without the second
+    assert asked == [ORDER[2]]
 
 
 @pytest.mark.parametrize(

@@ -43,10 +43,19 @@ def begun() -> State:
     return State.of(fit(study, ["mass:*"]), None)
 
 
-def found(likely: Sequence[bool], monkeypatch: pytest.MonkeyPatch, rules: Selection = STANDARD) -> State:
+def found(
+    likely: Sequence[bool],
+    monkeypatch: pytest.MonkeyPatch,
+    rules: Selection = STANDARD,
+    known_before: list[list[type[Effect]]] | None = None,
+) -> State:
     """A search whose rounds each add the next effect, which is likely or not, and which then ends."""
 
-    def try_next(state: State, library: Library, rules: object, say: object) -> tuple[State, list[Trial]]:
+    def try_next(
+        state: State, library: Library, rules: object, say: object, made: Sequence[Trial]
+    ) -> tuple[State, list[Trial]]:
+        if known_before is not None:
+            known_before.append([t.hypothesis.effect for t in made])
         known = {type(effect) for effect in state.effects}
         kind = next((e for e in library if e not in known), None)
         if kind is None:
@@ -100,6 +109,34 @@ def test_the_search_goes_on_without_what_went(monkeypatch: pytest.MonkeyPatch) -
         tuple(str(Hypothesis(e, ("elbow",), False, np.zeros(1), 0.0)) for e in ORDER[1:3])
     ]
     assert len(state.evidence) == 2
+
+
+def test_trials_of_the_state_that_the_search_goes_on_from_are_not_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    known: list[list[type[Effect]]] = []
+    found([True, False, False, True], monkeypatch, known_before=known)
+    # beside the first effect the second was tried; the search that goes on from there knows it
+    assert known == [[], [], [], [ORDER[1]], []]
+
+
+def test_a_trial_that_was_made_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = begun()
+    now, one = state.fitted, Hypothesis(CoulombFriction, ("elbow",), False, np.array([0.1]), 1.0)
+    other = replace(one, start=np.array([0.2]))
+    made: list[Hypothesis] = []
+
+    def attempt(study: Study, rest: Model, hypothesis: Hypothesis, rules: Selection, among: object) -> Trial:
+        made.append(hypothesis)
+        return Trial(hypothesis, now)
+
+    monkeypatch.setattr(module, "leading_hypotheses", lambda state, library, rules: ([one, other], 0))
+    monkeypatch.setattr(module, "attempt", attempt)
+    for check in ("is_superfluous", "is_outdone", "is_hopeless", "has_law"):
+        monkeypatch.setattr(module, check, lambda *_: False)
+    known = Trial(replace(one, gain=2.0), replace(now, holdout=0.5))
+    _, trials = module._try_promising(state, ORDER, STANDARD, lambda _: None, [known])
+    assert trials[0] is known
+    assert made == [other]
+    assert trials[1].hypothesis is other
 
 
 def test_it_does_not_go_on_where_it_may_not_or_little_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

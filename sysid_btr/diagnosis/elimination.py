@@ -41,7 +41,8 @@ SETTLED = 0.5
 
 def eliminate(state: State, library: Library, rules: Selection, progress: Progress) -> State:
     """The model with only those effects that data want, at the optimum and with intervals."""
-    state = _pruned(_without_unlikely(state.in_longest_steps(), rules), rules)
+    state, without = _without_unlikely(state.in_longest_steps(), rules)
+    state = _pruned(state, rules, without)
     if not state.effects:
         return state.in_first_steps()
     state = _pruned_where_changed(state, as_curves(state, library, rules), rules)
@@ -136,13 +137,14 @@ def _at_one_body(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, i
     return (trial if is_missed(rules, best.fitted, trial.fitted) else best), spent
 
 
-def _without_unlikely(state: State, rules: Selection) -> State:
+def _without_unlikely(state: State, rules: Selection) -> tuple[State, list[Fitted]]:
     """The state without effects that are not likely to be what they are called, beside one that is, the least first.
 
     Where errors of the model grow in a replay, what a form that is not quite right leaves grows too, and much takes it
-    up: it would move the amounts of what is right.
+    up: it would move the amounts of what is right. Beside the state, what it comes to without each of its effects,
+    where that was asked.
     """
-    removed: list[str] = []
+    removed, without = list[str](), list[Fitted]()
     while state.study.procedure.wanders and len(state.effects) > 1:
         without = [state.refitted_without(effect, rules.refit_seconds) for effect in state.effects]
         state = state.spent(sum(trial.evaluations for trial in without))
@@ -152,20 +154,24 @@ def _without_unlikely(state: State, rules: Selection) -> State:
             break
         effect = state.effects[least]
         removed.append(name_at(type(effect), effect.places))
-        state = replace(state, fitted=without[least], evidence=state.without_evidence_of(effect))
-    return state.step(removed=removed) if removed else state
+        state, without = replace(state, fitted=without[least], evidence=state.without_evidence_of(effect)), []
+    return (state.step(removed=removed) if removed else state), without
 
 
-def _pruned(state: State, rules: Selection) -> State:
+def _pruned(state: State, rules: Selection, without: Sequence[Fitted] = ()) -> State:
     """The state without effects, and then locations of effects, in demand only until a later effect was found.
 
-    The last one too: with it others may have come to values at which it is not missed.
+    The last one too: with it others may have come to values at which it is not missed. What the state comes to
+    `without` each of its effects need not be known.
     """
     removed: list[str] = []
     found = state.effects if len(state.effects) > 1 else ()
-    for effect in found:
-        trial = state.refitted_without(effect, rules.refit_seconds)
-        state = state.spent(trial.evaluations)
+    for i, effect in enumerate(found):
+        if without and not removed:
+            trial = without[i]
+        else:
+            trial = state.refitted_without(effect, rules.refit_seconds)
+            state = state.spent(trial.evaluations)
         if not is_needed(rules, trial, state.fitted, transient=effect.transient):
             removed.append(name_at(type(effect), effect.places))
             state = replace(state, fitted=trial, evidence=state.without_evidence_of(effect))

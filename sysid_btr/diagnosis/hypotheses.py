@@ -42,6 +42,11 @@ class Hypothesis:
         kinds = len(self.effect.kinds)
         return self.size // kinds * (kinds - len(self.effect.details))
 
+    def is_same(self, other: Hypothesis) -> bool:
+        """Whether both add the same, from the same first guess."""
+        ours, theirs = ((h.effect, h.places, h.shared) for h in (self, other))
+        return ours == theirs and np.array_equal(self.start, other.start)
+
     def initial_guesses(self) -> FloatArray:
         """Amounts (k, parameters) that a refit may begin from, those of the scan first."""
         kinds = len(self.effect.kinds)

@@ -53,18 +53,19 @@ ROUND_SHARE = 0.35
 """Expected fraction of a round in what is left of a search."""
 
 
-def search(state: State, library: Library, rules: Selection, progress: Progress) -> State:
+def search(state: State, library: Library, rules: Selection, progress: Progress, made: Sequence[Trial] = ()) -> State:
     """Add effects one at a time until nothing is left to explain, or nothing helps.
 
     What a form that is not quite right leaves, much would take up: nothing joins effects that explain the log already
     unless it is likely to be what it is called. Where errors of the model grow in a replay, what such a form leaves
     grows too. There an effect beside fewer that is not likely may become so once another is known; where the next is
     not likely either, both go (early stopping with patience: Prechelt 1998, doi:10.1007/3-540-49430-8_3). Where much is
-    left, the search goes on without them, so many times (limited discrepancy search: Harvey and Ginsberg 1995).
+    left, the search goes on without them, so many times (limited discrepancy search: Harvey and Ginsberg 1995); trials
+    that were `made` of the state it goes on from are not made again.
     """
-    sure, doubtful = state, list[Hypothesis]()
+    sure, doubtful, beside_sure = state, list[Hypothesis](), made
     for number in range(1, rules.rounds + 1):
-        state = _held_to_model(state)
+        from_sure, state = state is sure, _held_to_model(state)
         enough = at_floor(rules, state.fitted) or all_explained(rules, state.before, state.fitted)
         enough = enough and not is_implausible(state.fitted.prior_residual)
         if enough or not could_gain(rules, state.before, state.fitted):
@@ -82,8 +83,9 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             progress(done=at.replays, total=None, best=nan, note=f"round {number}: {note} {so_far}")
 
         with phase("", ROUND_SHARE):
-            state, trials = _try_promising(state, library, rules, say)
+            state, trials = _try_promising(state, library, rules, say, beside_sure if from_sure else ())
             recorded = _recorded(state, trials, rules)
+        beside_sure = trials if from_sure else beside_sure
         if recorded is not None:
             state = recorded
             continue
@@ -101,14 +103,15 @@ def search(state: State, library: Library, rules: Selection, progress: Progress)
             break
         state = _add(state, winner, trials, rules)
         doubtful = [] if likely else [*doubtful, winner.hypothesis]
-        sure = state if likely else sure
+        if likely:
+            sure, beside_sure = state, ()
         if sure.effects and len(doubtful) == rules.patience:
             sure = replace(sure, candidates=state.candidates, replays=state.replays, steps=state.steps)
             sure = sure.step(removed=[str(h) for h in doubtful])
             if not rules.detours or not something_left(rules, sure.before, sure.fitted):
                 return sure
             others = tuple(effect for effect in library if effect not in {h.effect for h in doubtful})
-            return search(sure, others, replace(rules, detours=rules.detours - 1), progress)
+            return search(sure, others, replace(rules, detours=rules.detours - 1), progress, beside_sure)
     return state
 
 
@@ -178,10 +181,13 @@ def _is_likely(state: State, winner: Trial | None, trials: Sequence[Trial], rule
     return not state.study.procedure.wanders or is_likely(rules, state.fitted, winner, trials)
 
 
-def _try_promising(state: State, library: Library, rules: Selection, say: Say) -> tuple[State, list[Trial]]:
+def _try_promising(
+    state: State, library: Library, rules: Selection, say: Say, made: Sequence[Trial]
+) -> tuple[State, list[Trial]]:
     """Refit the hypotheses of a scan, the most promising first, while they may matter.
 
-    Curves for which there is a law come last, and only where no law is likely.
+    Curves for which there is a law come last, and only where no law is likely. Trials of this state that were `made`
+    before are taken as they are.
     """
     say("scan for what lowers the held-out chi2")
     hypotheses, answers = leading_hypotheses(state, library, rules)
@@ -190,6 +196,10 @@ def _try_promising(state: State, library: Library, rules: Selection, say: Say) -
     waiting: list[Hypothesis] = []
 
     def tried(hypothesis: Hypothesis) -> State:
+        again = next((t for t in made if t.hypothesis.is_same(hypothesis)), None)
+        if again is not None:
+            trials.append(again)
+            return state
         others = (state.fitted, *(t.fitted for t in trials))
         trial = attempt(state.study, state.fitted.model, hypothesis, rules, others)
         trials.append(trial)
