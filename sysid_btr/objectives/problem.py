@@ -186,7 +186,7 @@ class ReplayProblem:
         Each with its share of the simulated time. Asked for the same number again, they are the same ones.
         """
         if most not in self._divisions:
-            steps = np.array([e.replay.grid.steps for e in self.episodes], dtype=np.float64)
+            steps = np.array([e.replay.steps for e in self.episodes], dtype=np.float64)
             middle = (np.cumsum(steps) - 0.5 * steps) / steps.sum()
             part = (middle * most).astype(np.int64)
             self._divisions[most] = tuple(

@@ -28,12 +28,12 @@ ALIKE = 0.6
 
 def group_replays(replays: Sequence[Replay]) -> list[tuple[int, ...]]:
     """Positions of the replays that can be simulated together, longest first in each party."""
-    order = sorted(range(len(replays)), key=lambda i: -replays[i].grid.steps)
+    order = sorted(range(len(replays)), key=lambda i: -replays[i].steps)
     found: list[list[int]] = []
     for i in order:
         for party in found:
             first = replays[party[0]]
-            if replays[i].grid.steps >= ALIKE * first.grid.steps and _joinable(first, replays[i]):
+            if replays[i].steps >= ALIKE * first.steps and _joinable(first, replays[i]):
                 party.append(i)
                 break
         else:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -65,6 +65,9 @@ class Replay:
     begun: Start | None = field(default=None, kw_only=True)
     base_start: BaseStates | None = field(default=None, kw_only=True)
 
+    made: ClassVar[tuple[str, ...]] = ("model", "index", "start", "grid", "switched")
+    """What is made of the robot's source, and of all of the log: another process is sent it."""
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Free numbers of a candidate, in the order of its columns."""
@@ -76,7 +79,7 @@ class Replay:
         It runs there on one thread: who sends it has many of them run side by side.
         """
         own = {f.name: getattr(self, f.name) for f in fields(self)}
-        made = {name: getattr(self, name) for name in ("model", "index", "start", "grid", "switched")}
+        made = {name: getattr(self, name) for name in self.made}
         robot = replace(self.robot, make_spec=made_elsewhere, configure=None)
         return {**own, **made, "robot": robot, "threads": 1}
 
@@ -147,6 +150,11 @@ class Replay:
     def grid(self) -> Grid:
         commands, (defaults, controls) = commanded(self.log, self.model), self.idle
         return make_grid(commands, self.index.joints, defaults, self.numerics.timestep, controls)
+
+    @property
+    def steps(self) -> int:
+        """That one candidate takes."""
+        return self.grid.steps
 
     def commands_between(self, borders: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Commands over steps of one's own, see `mean_commands`."""

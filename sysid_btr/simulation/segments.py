@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -152,6 +152,8 @@ class SegmentReplay(Replay):
 
     segments: Segments | None = None
 
+    made: ClassVar[tuple[str, ...]] = ("model", "index", "start", "given", "switched")
+
     @cached_property
     def lead(self) -> float:
         """How long before a segment commands may still reach into it, s: as long as any term can delay them."""
@@ -177,6 +179,10 @@ class SegmentReplay(Replay):
             end = int(low[-1]) + 1 if self.effort else int(high[-1])
             frames.append(_Frame(low, high, fraction, max(end, 1)))
         return frames
+
+    @property
+    def steps(self) -> int:
+        return sum(frame.steps for frame in self._frames)
 
     @cached_property
     def _began(self) -> FloatArray:
