@@ -297,6 +297,23 @@ def test_segments_from_the_states_of_a_whole_replay_give_that_replay(jitter: flo
         assert np.array_equal(alone.position[0, 220:321], segments.position[k, 220:321])
 
 
+def test_where_a_clock_puts_the_start_of_a_segment_costs_no_accuracy() -> None:
+    """Samples lie anywhere between the borders of a log's own steps; those of a segment begin with its first sample."""
+    robot, log = double_pendulum(dry='damping=".05"'), driven(jitter=0.4, seconds=2.0, torque=QUIET)
+    exact = Replay(robot, log, (), Numerics("RK4", 0.0003125)).predict(np.zeros((1, 0)))
+    rows = np.array([[k, k + 40] for k in range(100, 380, 40)])
+    first = rows[:, 0]
+    starts = Segments(rows, exact.position[0, first], exact.velocity[0, first], np.ones((len(rows), 4)))
+    fine, coarse = (
+        SegmentReplay(robot, log, (), Numerics("RK4", step), segments=starts).predict(np.zeros((1, 0)))
+        for step in (0.0025, 0.005)
+    )
+    worst = [float(np.abs(p.position - exact.position)[0, 100:380].max()) for p in (fine, coarse)]
+    moved = float(np.ptp(exact.position[0, 100:380], axis=0).max())
+    assert worst[1] < 1e-4 * moved, worst
+    assert worst[0] < worst[1], worst
+
+
 READERS = {
     EncoderOffset: (0.04,),
     EncoderOffsetInLoop: (-0.04,),
