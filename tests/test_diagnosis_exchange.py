@@ -6,11 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_diagnosis_search import begun
 from test_diagnosis_selection import fitted, trial
+from test_segmented import double_pendulum, driven
 
+from sysid_btr.diagnosis import exchange as module
 from sysid_btr.diagnosis.exchange import _at_fewer, _Part, _said_of_more, is_believed, preferred
 from sysid_btr.diagnosis.hypotheses import Hypothesis
 from sysid_btr.diagnosis.selection import STANDARD
+from sysid_btr.diagnosis.uncertainty import is_sized
+from sysid_btr.identify.refit import refit
+from sysid_btr.identify.study import make_study
+from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.terms.friction import CoulombFriction
 from sysid_btr.terms.model import Model
 from sysid_btr.terms.servo import Kp
@@ -57,9 +64,26 @@ def test_what_has_more_numbers_takes_a_place_where_data_miss_them(chance: float,
     assert preferred(STANDARD, [own, wider]) is (wider if replaced else own)
 
 
+@pytest.mark.parametrize("sized", [True, False])
 @pytest.mark.parametrize(("left", "believed"), [(4.9, True), (5.1, False)])
-def test_where_errors_grow_what_predicts_no_worse_with_fewer_numbers_is_believed(left: float, believed: bool) -> None:
-    """A band of eight numbers stood for a constant torque, and a name that is not likely took no place."""
+def test_where_errors_grow_what_predicts_no_worse_with_fewer_numbers_is_believed(
+    left: float, believed: bool, sized: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A band of eight numbers stood for a constant torque, and a name that is not likely took no place.
+
+    Nor does what has numbers that may all be nothing: beside it nothing else has an amount.
+    """
+    monkeypatch.setattr(module, "is_sized", lambda *_: sized)
+    study = begun().study
     band, simple = trial(JointSpring, fitted([5.0])), trial(CoulombFriction, fitted([left]))
-    assert is_believed(STANDARD, simple, [band, simple]) is believed
-    assert not is_believed(STANDARD, band, [simple, band])
+    assert is_believed(STANDARD, study, simple, [band, simple]) is (believed and sized)
+    assert not is_believed(STANDARD, study, band, [simple, band])
+
+
+@pytest.mark.parametrize(("planted", "sized"), [("0.05", True), ("0", False)])
+def test_what_may_be_nothing_has_no_size(planted: str, sized: bool) -> None:
+    log = driven(dry=f'frictionloss="{planted}"')
+    study = make_study(double_pendulum(), [log], numerics=Numerics("RK4", 0.005), threads=1)
+    term = CoulombFriction(("shoulder", "elbow"))
+    found = refit(study, Model.of((*study.declare(["mass:*"]), term), [1.0, 1.0, 0.02, 0.02]))
+    assert is_sized(study, found) is sized

@@ -174,6 +174,7 @@ def test_nothing_takes_a_place_that_is_unlikely_to_be_what_it_is_called(
 
     monkeypatch.setattr(exchange_module, "attempt", attempt)
     monkeypatch.setattr(exchange_module, "is_likely", lambda *_: likely)
+    monkeypatch.setattr(exchange_module, "is_sized", lambda *_: True)
     monkeypatch.setattr(SegmentedProcedure, "wanders", wanders)
     found = exchange(state, ORDER, STANDARD)
     assert [type(e) for e in found.effects] == [ORDER[1] if taken else ORDER[0]]

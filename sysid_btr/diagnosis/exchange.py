@@ -18,6 +18,8 @@ from sysid_btr.diagnosis.leads import Library, hypotheses_at, replacements
 from sysid_btr.diagnosis.selection import Selection
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt, near_best
+from sysid_btr.diagnosis.uncertainty import is_sized
+from sysid_btr.identify.study import Study
 from sysid_btr.terms.effect import Effect, family_of
 from sysid_btr.terms.free_form import FREE_FORMS
 from sysid_btr.terms.model import Model
@@ -123,7 +125,7 @@ def _compared(
     state = state.spent(sum(t.fitted.evaluations for t in trials[1:]))
     believed = trials
     if state.study.procedure.wanders:
-        believed = [t for t in trials if t is trials[0] or is_believed(rules, t, trials)]
+        believed = [t for t in trials if t is trials[0] or is_believed(rules, state.study, t, trials)]
     # where the model states what decides, data show next to nothing of it
     winner = likeliest(believed) if state.study.held else preferred(rules, believed)
     evidence = evidence_of(rules, winner, trials)
@@ -177,14 +179,17 @@ def _among(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> bool:
     return any(h.effect is hypothesis.effect and set(h.places) == set(hypothesis.places) for h in others)
 
 
-def is_believed(rules: Selection, trial: Trial, trials: Sequence[Trial]) -> bool:
+def is_believed(rules: Selection, study: Study, trial: Trial, trials: Sequence[Trial]) -> bool:
     """Whether a trial may take the place of the first one also where what is left grows in a replay.
 
-    Much would take that up, see `search`: it must be likely, or predict no worse with fewer numbers.
+    Much would take that up, see `search`: it must be likely, or predict no worse with fewer numbers, and some number of
+    it must not be nothing (`certainty.UNSIZED`).
     """
     own = trials[0]
     simpler = trial.hypothesis.complexity < own.hypothesis.complexity
-    return (simpler and trial.fitted.misfit <= own.fitted.misfit) or is_likely(rules, own.fitted, trial, trials)
+    believed = simpler and trial.fitted.misfit <= own.fitted.misfit
+    believed = believed or is_likely(rules, own.fitted, trial, trials)
+    return believed and is_sized(study, trial.fitted)
 
 
 def preferred(rules: Selection, trials: Sequence[Trial]) -> Trial:

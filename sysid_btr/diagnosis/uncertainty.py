@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid_btr.diagnosis.selection import Selection
+from sysid_btr.diagnosis.selection import Selection, differs_from
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.deferred import cheaper
@@ -15,9 +15,10 @@ from sysid_btr.identify.ends import followed
 from sysid_btr.identify.fixing import fix_unidentifiable
 from sysid_btr.identify.intervals import estimates, held_to_model
 from sysid_btr.identify.nuisance import error_of_the_rest
-from sysid_btr.identify.refit import judge, refit
+from sysid_btr.identify.refit import Fitted, judge, refit
 from sysid_btr.identify.sensitivity import with_sensitivity
 from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
+from sysid_btr.identify.study import Study
 
 
 def with_discrepancy(state: State) -> State:
@@ -73,3 +74,18 @@ def with_intervals(state: State, rules: Selection) -> State:
     last = judge(study, model.at(values))
     fitted = last if known is None else state.fitted
     return replace(state, study=study, fitted=fitted, estimates=found, reported=last)
+
+
+def is_sized(study: Study, fitted: Fitted) -> bool:
+    """Whether some number of a model's last term is not nothing, whatever torques could leave what it leaves."""
+    model, term = fitted.model, fitted.model.terms[-1]
+    problem = study.train_problem(model)
+    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
+    jacobian = np.nan_to_num(jacobian)
+    found = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks)
+    if study.redundancy:
+        found = held_to_model(found, problem.parameters)
+    if fitted.train > study.procedure.tolerated:
+        found = widened(found, problem, model.values, jacobian, residual, study.scales)
+    own = found[model.terms.columns(term)]
+    return any(differs_from(estimate, nothing) for estimate, nothing in zip(own, term.neutral, strict=True))

@@ -167,9 +167,7 @@ class SegmentedEpisode(Episode):
         """As for a whole replay, judged over segments as short as those of first fits, their starts integrated out.
 
         What a step does wrong grows along long ones as every other error does, which a fit answers for (`step_check`).
-        It is small beside what the plain model leaves, or beside the noise where that leaves none: half a step also
-        moves the borders between which a command is held, which no step is fine enough for where a clock jitters.
-        A start between two borders of steps is taken back to the first one, which is an error of the start.
+        It is small beside what the plain model leaves, or beside the noise where that leaves none.
         """
         if self.log.meta.servo_period:
             return choose_numerics(self.robot, self.log, threads, simulator)
