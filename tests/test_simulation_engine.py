@@ -35,7 +35,7 @@ from sysid_btr.simulation import mujoco_batch
 from sysid_btr.simulation import replay as replay_module
 from sysid_btr.simulation.base_states import BaseStates
 from sysid_btr.simulation.batching import batched_chunks, group_replays
-from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_over_steps, step_inputs
+from sysid_btr.simulation.grid import ALIGNED, make_grid, mean_commands, mean_over_steps, step_inputs
 from sysid_btr.simulation.numerics import Numerics
 from sysid_btr.simulation.replay import Replay
 from sysid_btr.simulation.segments import SegmentReplay, Segments
@@ -73,6 +73,15 @@ def test_the_mean_of_a_held_command_conserves_its_impulse(case: tuple[np.ndarray
     )
     assert mean.min() >= values.min() - 1e-9
     assert mean.max() <= values.max() + 1e-9
+
+
+def test_of_no_steps_there_is_no_mean() -> None:
+    """A log may have no segment of a length that is asked for."""
+    none = np.zeros((0, 4))
+    assert mean_over_steps(np.arange(3.0), np.ones((3, 2)), none).shape == (0, 3, 2)
+    command, extra = mean_commands(held(0.0, 0.1), ARM, ZERO, {}, none)
+    assert command.shape == (0, 3, 1)
+    assert extra.shape == (0, 3, 0)
 
 
 @given(held_commands())

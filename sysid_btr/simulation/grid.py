@@ -175,7 +175,7 @@ def mean_over_steps(time: FloatArray, held: FloatArray, borders: FloatArray) -> 
     -------
     (..., steps, k) array.
     """
-    span = np.diff(time, append=max(time[-1], float(borders.max())) + 1.0)
+    span = np.diff(time, append=float(np.max(borders, initial=time[-1])) + 1.0)
     # relative to the first value, so that the cumulative sum keeps its digits
     change = held - held[0]
     integral = np.vstack([np.zeros(held.shape[1]), np.cumsum(change * span[:, None], axis=0)])
@@ -190,7 +190,7 @@ def _at_samples_near(time: FloatArray, borders: FloatArray) -> FloatArray:
     """Borders, at the samples that are `ALIGNED` with them: no part of a command goes into the step before its own."""
     near = np.clip(np.round(np.interp(borders, time, np.arange(len(time)))).astype(np.int64), 0, len(time) - 1)
     there = time[near]
-    return np.where(np.abs(there - borders) < ALIGNED * np.diff(borders).min(), there, borders)
+    return np.where(np.abs(there - borders) < ALIGNED * np.min(np.diff(borders), initial=np.inf), there, borders)
 
 
 def step_inputs(log: Log, borders: FloatArray) -> dict[str, FloatArray]:
