@@ -24,9 +24,8 @@ from sysid_btr.diagnosis.selection import (
 )
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import Trial, attempt, is_wanted
-from sysid_btr.diagnosis.uncertainty import with_intervals
+from sysid_btr.diagnosis.uncertainty import linearised, with_intervals
 from sysid_btr.estimators.base import Progress, without_loss
-from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.coarse import LEAVES_MORE
 from sysid_btr.identify.refit import Fitted, inflate, refit
 from sysid_btr.identify.study import Study
@@ -81,10 +80,8 @@ def _states_in_turn(state: State) -> State:
 
 def _standard_errors(state: State) -> FloatArray:
     """(p,) of the parameters of a fitted model."""
-    model = state.fitted.model
-    problem = state.study.train_problem(model)
-    residual, jacobian = linearise(problem, model.values, step=state.study.stencil(model.terms))
-    return np.asarray(np.sqrt(np.diag(covariance(np.nan_to_num(jacobian), residual, problem.blocks))))
+    problem, residual, jacobian = linearised(state.study, state.fitted.model)
+    return np.asarray(np.sqrt(np.diag(covariance(jacobian, residual, problem.blocks))))
 
 
 def without_dispensable(study: Study, trial: Trial, rules: Selection) -> tuple[Trial, int]:

@@ -6,6 +6,7 @@ compare hypotheses with one another are in `sysid_btr.diagnosis.trials`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -361,9 +362,10 @@ def distance_from_nothing(found: Estimate, neutral: float) -> float:
     return abs(found.value - neutral) / max(found.std, 1e-300)
 
 
-def differs_from(found: Estimate, neutral: float) -> bool:
-    """Whether an amount is identifiable and its interval leaves out the value that does nothing."""
-    return found.identifiable != "no" and not found.ci95[0] <= neutral <= found.ci95[1]
+def has_size(found: Sequence[Estimate], neutral: FloatArray) -> bool:
+    """Whether some number of an effect is identifiable, with an interval that leaves out the (n,) `neutral` value."""
+    pairs = zip(found, neutral, strict=True)
+    return any(own.identifiable != "no" and not own.ci95[0] <= nothing <= own.ci95[1] for own, nothing in pairs)
 
 
 # --- verdict --------------------------------------------------------------------------------------------------

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid_btr.diagnosis.selection import Selection, differs_from
+from sysid_btr._typing import FloatArray
+from sysid_btr.diagnosis.selection import Selection, has_size
 from sysid_btr.diagnosis.state import State
 from sysid_btr.estimators.linearisation import linearise
 from sysid_btr.identify.deferred import cheaper
@@ -19,6 +20,8 @@ from sysid_btr.identify.refit import Fitted, judge, refit
 from sysid_btr.identify.sensitivity import with_sensitivity
 from sysid_btr.identify.step_check import SHIFT_TOLERATED, numerics_shift
 from sysid_btr.identify.study import Study
+from sysid_btr.objectives.problem import ReplayProblem
+from sysid_btr.terms.model import Model
 
 
 def with_discrepancy(state: State) -> State:
@@ -26,9 +29,8 @@ def with_discrepancy(state: State) -> State:
     study, model = state.study, state.fitted.model
     if state.reported is None or not state.fitted.train > study.procedure.tolerated:
         return state
-    problem = study.train_problem(model)
-    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
-    found = widened(state.estimates, problem, model.values, np.nan_to_num(jacobian), residual, study.scales)
+    problem, residual, jacobian = linearised(study, model)
+    found = widened(state.estimates, problem, model.values, jacobian, residual, study.scales)
     return replace(state, estimates=found)
 
 
@@ -41,11 +43,10 @@ def with_intervals(state: State, rules: Selection) -> State:
     study = state.study
     for refinement in range(rules.refinements + 1):
         model = state.fitted.model
-        problem = study.train_problem(model)
         if refinement == 0:
-            residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
-            jacobian = np.nan_to_num(jacobian)
+            problem, residual, jacobian = linearised(study, model)
         else:  # what half the step changes in the derivatives is far less than what is known of them
+            problem = study.train_problem(model)
             residual = problem.residuals(model.values[None])[0]
         slopes, shift, known = jacobian, numerics_shift(problem, model.values, jacobian, residual), None
         rest = error_of_the_rest(study, model, jacobian)
@@ -77,15 +78,19 @@ def with_intervals(state: State, rules: Selection) -> State:
 
 
 def is_sized(study: Study, fitted: Fitted) -> bool:
-    """Whether some number of a model's last term is not nothing, whatever torques could leave what it leaves."""
+    """Whether the last term of a model has a size, see `has_size`, whatever torques could leave what it leaves."""
     model, term = fitted.model, fitted.model.terms[-1]
-    problem = study.train_problem(model)
-    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
-    jacobian = np.nan_to_num(jacobian)
+    problem, residual, jacobian = linearised(study, model)
     found = estimates(problem.parameters, model.values, jacobian, residual, problem.blocks)
     if study.redundancy:
         found = held_to_model(found, problem.parameters)
     if fitted.train > study.procedure.tolerated:
         found = widened(found, problem, model.values, jacobian, residual, study.scales)
-    own = found[model.terms.columns(term)]
-    return any(differs_from(estimate, nothing) for estimate, nothing in zip(own, term.neutral, strict=True))
+    return has_size(found[model.terms.columns(term)], term.neutral)
+
+
+def linearised(study: Study, model: Model) -> tuple[ReplayProblem, FloatArray, FloatArray]:
+    """What a study fits, and residual (r,) and Jacobian (r, p) of it in a model; no slope where a simulation fails."""
+    problem = study.train_problem(model)
+    residual, jacobian = linearise(problem, model.values, step=study.stencil(model.terms))
+    return problem, residual, np.nan_to_num(jacobian)

@@ -8,7 +8,7 @@ from sysid_btr.diagnosis import certainty
 from sysid_btr.diagnosis.closing import Candidate, Closing, NamedEffect, Verdict
 from sysid_btr.diagnosis.evidence import Evidence, grounds_of, share_explained
 from sysid_btr.diagnosis.messages import message_of, sentence_of
-from sysid_btr.diagnosis.selection import Selection, differs_from, is_log_explained, something_left, verdict_limit
+from sysid_btr.diagnosis.selection import Selection, has_size, is_log_explained, something_left, verdict_limit
 from sysid_btr.diagnosis.signature import signature
 from sysid_btr.diagnosis.state import State
 from sysid_btr.diagnosis.trials import ADDED
@@ -100,8 +100,7 @@ def _named(
     known = grounds_of(evidence, off, now)
     # what alone explains a log is there, whichever of its numbers it is
     alone = len(state.effects) == 1
-    sized = alone or any(differs_from(estimate, nothing) for estimate, nothing in zip(own, effect.neutral, strict=True))
-    sure = certainty.STANDARD.certainty(known, sized=sized)
+    sure = certainty.STANDARD.certainty(known, sized=alone or has_size(own, effect.neutral))
     rest = sum(evidence.others.values())
     otherwise = {name: (1 - sure) * weight / max(rest, evidence.family) for name, weight in evidence.others.items()}
     return NamedEffect(

@@ -113,13 +113,12 @@ def mean_commands(
     log, joints, defaults, controls : see `make_grid`.
     borders : (..., steps + 1) s since the first sample, at equal distances. Before a log its first command holds.
     """
-    time = log.time - log.time[0]
-    borders = _at_samples_near(time, borders)
+    borders = _at_samples_near(log.time - log.time[0], borders)
     still, own = np.zeros(len(joints)), dict(controls)
-    extra = [_mean_command(log, time, tuple(own), np.array(list(own.values())), borders)]
+    extra = [_mean_command(log, tuple(own), np.array(list(own.values())), borders)]
     if any(log.joints(channel) for channel in FED_FORWARD):
-        extra += [_mean_command(log, time, joints, still, borders, channel) for channel in FED_FORWARD]
-    return _mean_command(log, time, joints, defaults, borders), np.concatenate(extra, axis=-1)
+        extra += [_mean_command(log, joints, still, borders, channel) for channel in FED_FORWARD]
+    return _mean_command(log, joints, defaults, borders), np.concatenate(extra, axis=-1)
 
 
 def at_samples(grid: Grid, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -136,12 +135,7 @@ def at_samples(grid: Grid, position: FloatArray, velocity: FloatArray) -> tuple[
 
 
 def _mean_command(
-    log: Log,
-    time: FloatArray,
-    joints: tuple[str, ...],
-    defaults: FloatArray,
-    borders: FloatArray,
-    channel: str = "command",
+    log: Log, joints: tuple[str, ...], defaults: FloatArray, borders: FloatArray, channel: str = "command"
 ) -> FloatArray:
     """Mean over each step of the command as the servo sees it; exact for a held command.
 
@@ -158,7 +152,8 @@ def _mean_command(
         middle = 0.5 * (borders[..., :-1] + borders[..., 1:])
         result[..., columns] = command_at(log, named, log.time[0] + middle.ravel(), channel).reshape(*middle.shape, -1)
     else:
-        result[..., columns] = mean_over_steps(time, command_at(log, named, log.time, channel), borders)
+        held = command_at(log, named, log.time, channel)
+        result[..., columns] = mean_over_steps(log.time - log.time[0], held, borders)
     return result
 
 
